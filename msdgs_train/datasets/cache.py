@@ -1,5 +1,6 @@
 """A cache of decoded images."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ class ImageCache:
     """Keeps decoded images as uint8 RGBA, up to `MAX_BYTES`."""
 
     def __init__(self) -> None:
-        self._pixels: dict[Path, np.ndarray] = {}
+        self._pixels: dict[tuple[Path, int], np.ndarray] = {}
 
     def image(self, frame: Frame, background: Tensor) -> Tensor:
         """Return the image of a frame, [H, W, 3] in [0, 1], over a background color, [3]."""
@@ -23,9 +24,18 @@ class ImageCache:
 
     def rgba(self, frame: Frame) -> np.ndarray:
         """Return the image of a frame, [H, W, 4] uint8, sRGB with straight alpha."""
-        rgba = self._pixels.get(frame.image_path)
+        return self._kept(frame, frame.load_rgba)
+
+    def half_rgba(self, frame: Frame) -> np.ndarray:
+        """Return it at the size of `frame.halved()`."""
+        half = frame.halved()
+        return self._kept(half, lambda: half.downscale(self.rgba(frame)))
+
+    def _kept(self, frame: Frame, read: Callable[[], np.ndarray]) -> np.ndarray:
+        key = (frame.image_path, frame.camera.width)
+        rgba = self._pixels.get(key)
         if rgba is None:
-            rgba = frame.load_rgba()
+            rgba = read()
             if (len(self._pixels) + 1) * rgba.nbytes <= MAX_BYTES:
-                self._pixels[frame.image_path] = rgba
+                self._pixels[key] = rgba
         return rgba

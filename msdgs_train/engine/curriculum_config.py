@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 from msdgs_train.settings import Checked
 
+HALVED_WIDTH = 320
+"""Narrower images always have their full size, in pixels."""
+
 
 @dataclass(frozen=True)
 class CurriculumConfig(Checked):
@@ -20,6 +23,11 @@ class CurriculumConfig(Checked):
     """The fraction of the run after which all times take part; 0: from the start. Until then half of the images are
     the newest of the window."""
 
+    half_resolution_fraction: float = 0.0
+    """The first fraction of the run trains on images of half the width and height if they are 320 pixels wide or more:
+    its steps are faster and add fewer Gaussians."""
+
     def __post_init__(self) -> None:
         self.require_fractions("static_fraction", "static_window_fraction", "window_full_fraction")
+        self.require_fractions("half_resolution_fraction")
         self.require(("window_start_width",), "in [0, 0.5]", lambda v: type(v) in (int, float) and 0 <= v <= 0.5)

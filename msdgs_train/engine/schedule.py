@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.curriculum_config import HALVED_WIDTH
 
 
 class Phase(NamedTuple):
@@ -22,6 +23,7 @@ class Schedule(NamedTuple):
     static_steps: int  # all images, no deformation
     deform_start_step: int
     full_window_step: int  # all times take part
+    full_resolution_step: int  # wide images have their full size
     refine_start: int  # the first step of density control, counted from 1
     refine_every: int  # 0: no density control
     refine_stop: int  # the last step of density control, counted from 1
@@ -41,6 +43,7 @@ class Schedule(NamedTuple):
             static_steps,
             deform_start_step=round((c.static_fraction + static_window) * steps),
             full_window_step=round(c.window_full_fraction * steps),
+            full_resolution_step=round(c.half_resolution_fraction * steps),
             refine_start=round(config.density.refine_start_fraction * steps),
             refine_every=_interval(config.density.refine_every_fraction, steps),
             refine_stop=round(config.density.refine_stop_fraction * steps),
@@ -72,6 +75,10 @@ class Schedule(NamedTuple):
         start = c.curriculum.window_start_width
         grown = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
         return start + (0.5 - start) * grown if grown < 1 else 0.5
+
+    def halves(self, width: int, step: int) -> bool:
+        """Whether an image so wide is trained at half its width and height."""
+        return width >= HALVED_WIDTH and step < self.full_resolution_step
 
     def deforms(self, step: int) -> bool:
         """Whether the deformation takes part."""

@@ -206,7 +206,11 @@ class Trainer:
 
     @sharing_cores()
     def _differentiate(self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor) -> ViewGradients:
-        target = Target.over(self._images.rgba(frame), background, self.config.run.device)
+        if self.schedule.halves(frame.camera.width, self.step_count):
+            rgba, frame = self._images.half_rgba(frame), frame.halved()
+        else:
+            rgba = self._images.rgba(frame)
+        target = Target.over(rgba, background, self.config.run.device)
         view = self.system.loss(frame, target, background.to(target.rgb.device), self.step_count)
         return differentiate(groups, frame, view, target.rgb)
 

@@ -24,6 +24,7 @@ register_system(
         steps=20_000,
         static_fraction=0.05,
         window_full_fraction=0.65,
+        half_resolution_fraction=0.35,
         eps2d_init=0.3,
         ema_fraction=1 / 40,
         sh_degree_fraction=1 / 20,

@@ -34,7 +34,16 @@ class Frame:
         if self.distortion is not None:
             height, width, _ = rgba.shape
             rgba = undistort(rgba, self.camera.resized(width, height), self.distortion)
+        return self.downscale(rgba)
+
+    def downscale(self, rgba: np.ndarray) -> np.ndarray:
+        """Downscale an image of this frame without distortion, uint8 [H, W, 4], to the camera's size."""
         return resize_area(rgba, self.camera.width, self.camera.height)
+
+    def halved(self) -> "Frame":
+        """The same frame at half the width and height, rounded down but at least 1."""
+        width, height = (max(side // 2, 1) for side in (self.camera.width, self.camera.height))
+        return replace(self, camera=self.camera.resized(width, height))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,51 @@
+"""The first part of a run has images of half the size."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from msdgs_train.datasets import load_scene
+from msdgs_train.datasets.cache import ImageCache
+from msdgs_train.datasets.common.images import resize_area
+from msdgs_train.engine import schedule as schedule_module
+from msdgs_train.engine.schedule import Schedule
+from msdgs_train.engine.trainer import Trainer
+from tests.support.training_scene import SIZE, small_config
+
+STEPS = 6
+
+
+def test_images_are_halved_in_the_first_part(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schedule_module, "HALVED_WIDTH", SIZE)
+    trainer = Trainer(small_config(steps=STEPS, half_resolution_fraction=0.5), load_scene(data))
+    seen: list[tuple[int, ...]] = []
+    loss = trainer.system.loss
+
+    def noted(frame, target, background, step):
+        view = loss(frame, target, background, step)
+        assert target.rgb.shape == view.rgb.shape
+        seen.append((frame.camera.width, frame.camera.height, len(target.alpha)))
+        return view
+
+    monkeypatch.setattr(trainer.system, "loss", noted)
+    for _ in range(STEPS):
+        trainer.step()
+    assert seen == 3 * [3 * (SIZE // 2,)] + 3 * [3 * (SIZE,)]
+
+
+@pytest.mark.parametrize(("width", "expected"), [(319, False), (320, True)])
+def test_small_images_have_their_size(width: int, expected: bool) -> None:
+    schedule = Schedule.from_config(small_config(steps=STEPS, half_resolution_fraction=0.5))
+    assert [schedule.halves(width, step) for step in (0, 2, 3)] == [expected, expected, False]
+
+
+def test_a_half_image_is_the_mean_of_four_pixels_of_the_same_view(data: Path) -> None:
+    frame, cache = load_scene(data).splits["train"][0], ImageCache()
+    half = frame.halved()
+    assert (half.camera.fx, half.camera.cy) == (frame.camera.fx / 2, frame.camera.cy / 2)
+    for _ in range(2):
+        np.testing.assert_array_equal(cache.half_rgba(frame), resize_area(frame.load_rgba(), SIZE // 2, SIZE // 2))
+        np.testing.assert_array_equal(cache.rgba(frame), frame.load_rgba())
+    one = half.halved().halved().halved().halved().halved().halved().halved()
+    assert (one.camera.width, one.camera.height) == (1, 1)
