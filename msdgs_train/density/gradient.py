@@ -70,7 +70,7 @@ class GradientStrategy(DensityStrategy):
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """`densify` and `reset_opacities` when they are due."""
-        if self.patience and not self.is_rig and self.schedule.window(steps.stop - 1) < 0.5:
+        if self.patience and not self.is_rig and self.schedule.is_windowed(steps.stop - 1):
             self.unseen[self.unseen.isfinite()] = 0  # images outside the window may show what those inside don't
         if any(map(self.schedule.refines_at, steps)):
             self.densify(surgery, steps[-1])

@@ -26,7 +26,7 @@ class WindowCurriculum:
 
     def next(self, number: int, step: int, generator: torch.Generator) -> Frame:
         window = self._schedule.window(step)
-        if window < 0.5 and number % 2 == 1 and step >= self._schedule.deform_start_step:
+        if number % 2 == 1 and self._schedule.deforms(step) and self._schedule.is_windowed(step):
             new = self._new_frames(window)
             return self._frames[int(new[torch.randint(len(new), (), generator=generator)])]
         self.order = self.order[self.distances[self.order] <= window]

