@@ -17,6 +17,7 @@ class ImageCache:
 
     def __init__(self) -> None:
         self._pixels: dict[tuple[Path, int], np.ndarray] = {}
+        self._bytes = 0
 
     def image(self, frame: Frame, background: Tensor) -> Tensor:
         """Return the image of a frame, [H, W, 3] in [0, 1], over a background color, [3]."""
@@ -36,6 +37,7 @@ class ImageCache:
         rgba = self._pixels.get(key)
         if rgba is None:
             rgba = read()
-            if (len(self._pixels) + 1) * rgba.nbytes <= MAX_BYTES:
+            if self._bytes + rgba.nbytes <= MAX_BYTES:
                 self._pixels[key] = rgba
+                self._bytes += rgba.nbytes
         return rgba

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msdgs_train.datasets import load_scene
+from msdgs_train.datasets import Frame, load_scene
+from msdgs_train.datasets import cache as cache_module
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine import schedule as schedule_module
@@ -49,3 +50,16 @@ def test_a_half_image_is_the_mean_of_four_pixels_of_the_same_view(data: Path) ->
         np.testing.assert_array_equal(cache.rgba(frame), frame.load_rgba())
     one = half.halved().halved().halved().halved().halved().halved().halved()
     assert (one.camera.width, one.camera.height) == (1, 1)
+
+
+def test_the_cache_keeps_no_more_bytes_than_its_limit(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, other = load_scene(data).splits["train"][:2]
+    read, load = [], Frame.load_rgba
+    monkeypatch.setattr(Frame, "load_rgba", lambda frame: read.append(frame.name) or load(frame))
+    monkeypatch.setattr(cache_module, "MAX_BYTES", 5 * SIZE * SIZE)  # one image and its half
+    cache = ImageCache()
+    for _ in range(2):
+        cache.half_rgba(one)
+        cache.rgba(one)
+        cache.rgba(other)
+    assert read == [one.name, other.name, other.name]
