@@ -28,7 +28,7 @@ class ImageCache:
         return self._kept(frame, frame.load_rgba)
 
     def half_rgba(self, frame: Frame) -> np.ndarray:
-        """Return it at the size of `frame.halved()`."""
+        """Return the image of `frame.halved()`, downscaled from that of the frame, so that a file is read once."""
         half = frame.halved()
         return self._kept(half, lambda: half.downscale(self.rgba(frame)))
 

@@ -20,9 +20,8 @@ class CurriculumConfig(Checked):
     window_start_width: float = 0.03
     """Half width at which the time window, centered in the scene's time, begins to grow, as a fraction of that time."""
     window_full_fraction: float = 0.75
-    """The fraction of the run after which all times take part; 0: from the start. Until then half of the images are
-    the newest of the window."""
-
+    """The fraction of the run after which all times take part alike; 0: from the start. Until then half of the images
+    are the newest of the window."""
     half_resolution_fraction: float = 0.0
     """The first fraction of the run trains on images of half the width and height if they are 320 pixels wide or more:
     its steps are faster and add fewer Gaussians."""

@@ -8,7 +8,7 @@ from msdgs_train.engine.curriculum_config import HALVED_WIDTH
 
 WINDOW_GROWTH = 0.95
 """Fraction of the growing phase after which the window has all times: the first and the last of them are its newest for
-the rest. Of nine fixed cameras, their images gain 3 dB."""
+the rest. Of nine fixed cameras, their images gain 1 to 3 dB."""
 
 
 class Phase(NamedTuple):
@@ -26,7 +26,7 @@ class Schedule(NamedTuple):
     num_steps: int
     static_steps: int  # all images, no deformation
     deform_start_step: int
-    full_window_step: int  # all times take part
+    full_window_step: int  # all times take part alike
     full_resolution_step: int  # wide images have their full size
     refine_start: int  # the first step of density control, counted from 1
     refine_every: int  # 0: no density control
@@ -109,7 +109,7 @@ class Schedule(NamedTuple):
         return every > 0 and self.refine_start <= step <= self.refine_stop and step % every == 0
 
     def prunes_hidden(self, step: int) -> bool:
-        """Whether density control goes on and all times take part in this step: `gradient` regularizes then."""
+        """Whether density control goes on and all times take part alike in this step: `gradient` regularizes then."""
         return step < self.refine_stop and not self.is_windowed(step)
 
     def resets_at(self, step: int) -> bool:
