@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import onnx
@@ -88,7 +89,7 @@ def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: fl
 
 
 def _sequence(session: DeformationSession, options: ConvertOptions, console: Console) -> str:
-    """Write a folder of PLY files."""
+    """Write a folder of PLY files: all of them, or none."""
     if options.t is not None:
         raise InvalidInput("t", "left out for a folder; --frames is the number of files", options.t)
     out, times = options.out, _times(session, options)
@@ -96,10 +97,14 @@ def _sequence(session: DeformationSession, options: ConvertOptions, console: Con
     if any(each.suffix == ".ply" for each in out.iterdir()):
         raise InvalidInput("out", "a folder without PLY files", str(out))
     digits = len(str(len(times) - 1))
-    worst = min(
-        _one(session, options, out / f"{options.scene.stem}_{number:0{digits}}.ply", t)
-        for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
-    )
+    with TemporaryDirectory(prefix=".frames.", dir=out) as temporary:
+        folder = Path(temporary)
+        worst = min(
+            _one(session, options, folder / f"{options.scene.stem}_{number:0{digits}}.ply", t)
+            for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
+        )
+        for file in sorted(folder.iterdir()):
+            file.replace(out / file.name)
     return f"{len(times)} files, the worst {worst:.1f} dB"
 
 

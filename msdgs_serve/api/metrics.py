@@ -23,10 +23,10 @@ class Metrics:
         self._requests = Counter(
             "msdgs_requests", "Requests answered", ("method", "route", "status"), registry=self._registry
         )
+        duration = "Time from the headers of a request to the last byte of its response"
         self._latency = Histogram(
-            "msdgs_request_seconds", "Time from the headers of a request to the last byte of its response", ("route",),
-            buckets=SECONDS, registry=self._registry,
-        )  # fmt: skip
+            "msdgs_request_seconds", duration, ("route", "status"), buckets=SECONDS, registry=self._registry
+        )
         self._stages = Histogram(
             "msdgs_stage_seconds", "Time of the stages of a frame: queue, pose, draw, encode", ("stage",),
             buckets=SECONDS, registry=self._registry,
@@ -41,7 +41,7 @@ class Metrics:
     def count_request(self, method: str, route: str, status: int, seconds: float, sent: int) -> None:
         """Count an answered request."""
         self._requests.labels(method, route, str(status)).inc()
-        self._latency.labels(route).observe(seconds)
+        self._latency.labels(route, str(status)).observe(seconds)
         self._bytes.labels(route).inc(sent)
 
     def count_problem(self, kind: str) -> None:

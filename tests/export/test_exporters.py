@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from export.exporters import gltf
 from export.exporters.command import LOSSLESS, LOSSY, convert
 from export.exporters.gltf import EXTENSION, read_gltf, write_gltf
+from export.exporters.ply import write_ply
 from export.exporters.round_trip import ConversionFailed, visionary_of
 from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
@@ -73,6 +74,25 @@ def test_a_sequence_covers_the_scenes_time(tmp_path: Path):
     assert np.abs(read_splats(files[-1]).gaussians.means - last.means).max() < tolerance("splat_values")
     with pytest.raises(InvalidInput, match=r"a folder without PLY files"):
         run(scene, tmp_path / "frames", frames=3)
+
+
+def test_an_interrupted_sequence_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scene, written = scene_file(tmp_path), []
+
+    def write_two(file: Path, gaussians: Gaussians) -> None:
+        if len(written) == 2:
+            raise KeyboardInterrupt
+        write_ply(file, gaussians)
+        written.append(file)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("export.exporters.command.write_ply", write_two)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, tmp_path / "frames", frames=4)
+    assert len(written) == 2
+    assert list((tmp_path / "frames").iterdir()) == []
+    run(scene, tmp_path / "frames", frames=4)
+    assert len(list((tmp_path / "frames").iterdir())) == 4
 
 
 def test_of_switched_frames_only_the_one_that_is_shown_is_written(tmp_path: Path):

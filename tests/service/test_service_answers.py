@@ -263,6 +263,8 @@ def test_metrics_are_what_the_client_counted(scene: Path):
         assert requests['{method="POST",route="/render",status="200"}'] == count
         assert requests['{method="POST",route="/render",status="422"}'] == count
         assert numbers(client, "msdgs_problems_total")['{kind="invalid"}'] == count
+        durations = numbers(client, "msdgs_request_seconds_count")
+        assert durations['{route="/render",status="200"}'] == durations['{route="/render",status="422"}'] == count
         assert numbers(client, "msdgs_stage_seconds_count")['{stage="encode"}'] == count
         video = {"frames": [{"camera": ORBIT, "t": t} for t in (0.0, 0.5, 1.0)], "width": 16, "height": 16}
         assert post(client, t=[0.0, 0.5]).status_code == client.post("/render/video", json=video).status_code == 200
