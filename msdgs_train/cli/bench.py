@@ -55,12 +55,13 @@ class Bench:
             minutes = 30.0 if self.whole else 5.0
         budget = Budget(steps=None, minutes=minutes, threads=self.threads, time=self.time)
         scenes = read_scenes(self.data, short=not self.whole, names=self.scenes)
-        runs = make_bench_runs(read_systems(self.systems, budget), scenes, self.seeds, self.out)
+        systems = read_systems(self.systems, budget)
+        runs = make_bench_runs(systems, scenes, self.seeds, self.out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
             complete = train_and_measure(runs, scenes, csv, self.jobs, on_end)
         rows = rows_of(runs, csv)
         if rows:
-            paths = write_bench(self.out, rows)
+            paths = write_bench(self.out, rows, list(systems))
             console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, highlight=False)
             console.print("wrote " + ", ".join(map(str, [csv, *paths])), soft_wrap=True)
         if not complete:

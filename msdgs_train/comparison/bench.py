@@ -158,9 +158,9 @@ def runs_left(runs: Sequence[Run], csv_file: Path) -> list[Run]:
 
 
 def rows_of(runs: Sequence[Run], csv_file: Path) -> list[Row]:
-    """The rows of these runs in the file."""
-    wanted = set(map(key_of, runs))
-    return [row for row in read_rows(csv_file) if key_of_row(row) in wanted]
+    """The rows of these runs in the file, in the order of the runs."""
+    found = {key_of_row(row): row for row in read_rows(csv_file)}
+    return [found[key_of(run)] for run in runs if key_of(run) in found]
 
 
 def measure(run: Run, scene: BenchScene) -> Row:

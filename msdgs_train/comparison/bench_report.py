@@ -17,17 +17,18 @@ RESAMPLES = 2000
 INTERVAL = (2.5, 97.5)  # percentiles of the bootstrap
 
 
-def write_bench(out: Path, rows: Sequence[Row]) -> list[Path]:
-    """Write the table and the figure into the folder `out`, each atomically; returns their paths."""
+def write_bench(out: Path, rows: Sequence[Row], systems: Sequence[str]) -> list[Path]:
+    """Write the table and the figure into the folder `out`, each atomically; returns their paths. Gains are over the
+    first of the systems."""
     out.mkdir(parents=True, exist_ok=True)
-    write_text(out / TABLE, as_markdown(rows))
-    save_figure(draw(rows), out / PLOT)
+    write_text(out / TABLE, as_markdown(rows, systems))
+    save_figure(draw(rows, systems), out / PLOT)
     return [out / TABLE, out / PLOT]
 
 
-def as_markdown(rows: Sequence[Row]) -> str:
+def as_markdown(rows: Sequence[Row], systems: Sequence[str]) -> str:
     """A line per scene, and the mean over the scenes that all systems have; a column per system and split."""
-    systems, scenes = _names(rows, "system"), _names(rows, "scene")
+    scenes = _scenes(rows)
     lines = [[scene, *(_cell(rows, scene, system, s) for s in SPLITS for system in systems)] for scene in scenes]
     means = [_mean_over_scenes(rows, scenes, systems, split) for split in SPLITS]
     lines.append(["mean", *(f"{value:.2f}" if value is not None else "–" for of_split in means for value in of_split)])
@@ -50,9 +51,9 @@ def as_markdown(rows: Sequence[Row]) -> str:
     return "\n".join([*shown, "", notes]) + "\n"
 
 
-def draw(rows: Sequence[Row]) -> Figure:
+def draw(rows: Sequence[Row], systems: Sequence[str]) -> Figure:
     """A dot per scene, system and seed: PSNR on test images, or on val where there are none."""
-    systems, scenes = _names(rows, "system"), _names(rows, "scene")
+    scenes = _scenes(rows)
     figure = Figure(figsize=(8, 1.5 + 0.45 * len(scenes)), layout="constrained")
     axes = figure.subplots()
     for index, system in enumerate(systems):
@@ -80,9 +81,8 @@ def paired_gain(gains: Sequence[np.ndarray]) -> tuple[float, float, float]:
     return float(np.mean([of.mean() for of in gains])), float(low), float(high)
 
 
-def _names(rows: Sequence[Row], column: str) -> list[str]:
-    """The different values of a column, in order."""
-    return list(dict.fromkeys(row[column] for row in rows))
+def _scenes(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["scene"] for row in rows))
 
 
 def machines_of(rows: Sequence[Row]) -> str:

@@ -27,15 +27,15 @@ def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0) -> 
     """Read the dataset in folder `path`, detecting its layout.
 
     `size` is the width in pixels that images are reduced to, height in proportion; `llffhold` that of `DataConfig`.
-    Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and `InvalidInput` for
-    an unusable `size` or `llffhold`.
+    Times are in [0, 1]. Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and
+    `InvalidInput` for an unusable `size` or `llffhold`.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
     for _, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
-            scene = load(folder, size)
+            scene = load(folder, size).in_unit_time()
             return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
     raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

@@ -1,7 +1,7 @@
 """nerfstudio layout: one `transforms.json` beside the images.
 
 The JSON has `frames`; each has `file_path` (relative to the folder), `transform_matrix` (camera to world, OpenGL axes)
-and maybe `time`, which may be outside [0, 1]. A scene whose frames have no `time` is static, t = 0. `fl_x`, `fl_y`,
+and maybe `time`, in any unit. A scene whose frames have no `time` is static, t = 0. `fl_x`, `fl_y`,
 `cx`, `cy`, `w`, `h` in pixels, or else `camera_angle_x` in radians, are given per frame or for all; pixel centers are
 at half-integers, as in `Camera`. `camera_model` and the distortion `k1`, `k2`, `p1`, `p2`, `k3` likewise: they are
 OpenCV's, and `Frame.load_rgba` removes the distortion by bilinear interpolation, to a pinhole camera with the same

@@ -14,6 +14,9 @@ NEW_FRAME_BORDER = 0.01
 """Images within this fraction of the time range of the window's border are new frames."""
 MIN_NEW_FRAME_DISTANCE = 0.7
 """New frames are at least this fraction of the half width from the middle; the outermost image always is one."""
+SAME_DISTANCE = 1e-6
+"""Distances from the middle that differ by less are the same: those of the two middle times of an even number do by
+rounding."""
 
 
 class WindowCurriculum:
@@ -43,9 +46,10 @@ class WindowCurriculum:
 
 
 def distances_from_middle(time_range: tuple[float, float], frames: list[Frame]) -> Tensor:
-    """[F] in [0, 0.5], as fractions of the time range; the nearest is set to 0 so that no window is empty."""
+    """[F] in [0, 0.5], as fractions of the time range; those of the nearest times are 0: every window has images of all
+    cameras."""
     first, last = time_range
     middle, length = (first + last) / 2, (last - first) or 1.0
     distances = torch.tensor([min(abs(frame.t - middle) / length, 0.5) for frame in frames], dtype=torch.float64)
-    distances[distances.argmin()] = 0
+    distances[distances <= distances.min() + SAME_DISTANCE] = 0
     return distances

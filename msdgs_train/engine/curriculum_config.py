@@ -29,4 +29,4 @@ class CurriculumConfig(Checked):
     def __post_init__(self) -> None:
         self.require_fractions("static_fraction", "static_window_fraction", "window_full_fraction")
         self.require_fractions("half_resolution_fraction")
-        self.require(("window_start_width",), "in [0, 0.5]", lambda v: type(v) in (int, float) and 0 <= v <= 0.5)
+        self.require(("window_start_width",), "in [0, 0.5)", lambda v: type(v) in (int, float) and 0 <= v < 0.5)

@@ -27,15 +27,20 @@ class MetricsLog:
     With `tensorboard` the same numbers also go to event files in `tensorboard/`, and so do images.
     """
 
-    def __init__(self, run: Path, *, keep_until: int = 0, tensorboard: bool = False) -> None:
-        """Keep the lines up to step `keep_until` and drop later ones."""
+    def __init__(
+        self, run: Path, *, keep_until: int = 0, keep_evaluations: bool = True, tensorboard: bool = False
+    ) -> None:
+        """Keep the lines up to step `keep_until` and drop later ones, and evaluations of this step unless they are to
+        be kept."""
         self._run, self._tensorboard = run, tensorboard
         self._events: SummaryWriter | None = None
-        self.rewind(keep_until)
+        self.rewind(keep_until, keep_evaluations=keep_evaluations)
 
-    def rewind(self, step: int) -> None:
-        """Drop the lines of steps after `step`."""
+    def rewind(self, step: int, *, keep_evaluations: bool = True) -> None:
+        """Drop the lines of steps after `step`, and evaluations of this step unless they are to be kept."""
         kept = [line for line in read_metrics(self._run) if line["step"] <= step]
+        if not keep_evaluations:
+            kept = [line for line in kept if (line["kind"], line["step"]) != ("eval", step)]
         write_text(self._run / METRICS, "".join(json.dumps(line) + "\n" for line in kept))
         self.close()
         if self._tensorboard:

@@ -106,6 +106,8 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         seconds = trainer.load_checkpoint(folder / CHECKPOINT) if stored else 0.0
         if stored:
             require_same_phase(Schedule.from_config(stored), Schedule.from_config(config), trainer.step_count)
+            if trainer.step_count >= config.run.steps and stored.run.minutes != config.run.minutes:
+                raise InvalidInput("config.minutes", "unchanged, as the run is finished", config.run.minutes)
         folder.mkdir(parents=True, exist_ok=True)
         lock = lock or on_error.enter_context(_locked(folder))
         write_config(folder, config)
@@ -114,7 +116,10 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
             (folder / BEST).unlink(missing_ok=True)
         record = RunRecord(data.absolute(), best)
         write_record(folder, record)
-        log = MetricsLog(folder, keep_until=trainer.step_count, tensorboard=tensorboard)
+        is_finished = trainer.step_count >= config.run.steps  # its last model is evaluated again
+        log = MetricsLog(
+            folder, keep_until=trainer.step_count, keep_evaluations=not is_finished, tensorboard=tensorboard
+        )
         on_error.pop_all()
     return RunState(folder, trainer, log, record, seconds, lock)
 

@@ -30,7 +30,7 @@ class Schedule(NamedTuple):
     full_resolution_step: int  # wide images have their full size
     refine_start: int  # the first step of density control, counted from 1
     refine_every: int  # 0: no density control
-    refine_stop: int  # the last step of density control, counted from 1
+    refine_stop: int  # the last step of density control, counted from 1; 0 without it
     reset_every: int  # 0: opacities are never reset
     sh_degree_interval: int
     ema_steps: int  # 0: no average
@@ -40,6 +40,7 @@ class Schedule(NamedTuple):
         """The schedule of these settings."""
         c, steps = config.curriculum, config.run.steps
         static_window = c.static_window_fraction if c.window_full_fraction else 0.0
+        refine_stop = config.density.refine_stop_fraction if config.density.refine_every_fraction else 0.0
         static_steps = round(c.static_fraction * steps)
         return cls(
             config,
@@ -50,7 +51,7 @@ class Schedule(NamedTuple):
             full_resolution_step=round(c.half_resolution_fraction * steps),
             refine_start=round(config.density.refine_start_fraction * steps),
             refine_every=_interval(config.density.refine_every_fraction, steps),
-            refine_stop=round(config.density.refine_stop_fraction * steps),
+            refine_stop=round(refine_stop * steps),
             reset_every=_interval(config.density.reset_every_fraction, steps),
             sh_degree_interval=_interval(config.optimizer.sh_degree_fraction, steps),
             ema_steps=_interval(config.optimizer.ema_fraction, steps),

@@ -26,9 +26,10 @@ class Target(NamedTuple):
 
     @property
     def shows_all(self) -> bool:
-        """Whether the border is transparent all around, so that nothing of the scene is outside the image."""
+        """Whether the border is transparent around what the image shows, so that nothing of the scene is outside it; an
+        empty image may have all of it outside."""
         a = self.alpha
-        return not bool(a[0].any() or a[-1].any() or a[:, 0].any() or a[:, -1].any())
+        return bool(a.any()) and not bool(a[0].any() or a[-1].any() or a[:, 0].any() or a[:, -1].any())
 
     def alpha_error(self, alpha: Tensor) -> Tensor:
         """Mean absolute difference of a rendering's alpha, [H, W] in [0, 1], or 0 if the image is opaque."""

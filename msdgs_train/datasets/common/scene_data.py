@@ -62,6 +62,19 @@ class SceneData:
         times = [frame.t for frames in self.splits.values() for frame in frames]
         return min(times), max(times)
 
+    def in_unit_time(self) -> "SceneData":
+        """The same scene; if times outside [0, 1] occur, all are scaled to it: layers take float32, and expect that."""
+        first, last = self.time_range
+        if first >= 0 and last <= 1:
+            return self
+        length = (last - first) or 1.0
+
+        def scaled(frames: list[Frame]) -> list[Frame]:
+            return [replace(frame, t=(frame.t - first) / length) for frame in frames]
+
+        splits = {split: scaled(frames) for split, frames in self.splits.items()}
+        return replace(self, splits=splits, unsplit=None if self.unsplit is None else scaled(self.unsplit))
+
     def split_again(self, every: int) -> "SceneData":
         """Split the training frames, or all frames of a dataset that names no splits, as `DataConfig.llffhold` says.
 

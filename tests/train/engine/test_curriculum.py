@@ -8,11 +8,17 @@ import pytest
 import torch
 
 from msdgs_train.datasets import Frame, SceneData, load_scene
-from msdgs_train.engine.curriculum import MIN_NEW_FRAME_DISTANCE, NEW_FRAME_BORDER, WindowCurriculum
+from msdgs_train.engine.curriculum import (
+    MIN_NEW_FRAME_DISTANCE,
+    NEW_FRAME_BORDER,
+    WindowCurriculum,
+    distances_from_middle,
+)
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.spline import SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
+from tests.support.scene_files import level_camera
 from tests.support.training_scene import SPLINES, small_config, trained, write_scene
 
 
@@ -65,6 +71,15 @@ def test_the_window_grows_from_the_middle(scene: SceneData, batch_size: int) -> 
             assert distance(scene, frame.t) >= min(outermost, border) - 2e-9
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 6, 7, 16])
+def test_a_window_always_has_all_cameras(count: int) -> None:
+    frames = [Frame(f"{camera}_{i}", level_camera(), i / (count - 1), Path()) for i in range(count) for camera in "abc"]
+    distances = distances_from_middle((0.0, 1.0), frames)
+    middle = [frame.t for frame, distance in zip(frames, distances.tolist(), strict=True) if distance == 0]
+    nearest = [count // 2] if count % 2 else [count // 2 - 1, count // 2]
+    assert middle == [i / (count - 1) for i in nearest for _ in "abc"]
+
+
 def test_a_single_time_leaves_no_window_empty(tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path, train=1))
     assert {frame.name for frame in frames_drawn(scene, range(1000))} == {scene.splits["train"][0].name}
@@ -79,6 +94,16 @@ def test_regularizers_begin_with_the_deformation(scene: SceneData, monkeypatch: 
     trained(small_config(model=SPLINES, steps=100, **PHASES), scene, 40)
     assert smooth == pytest.approx([frame.t for frame in drawn[20:]])
     assert len(rigid) == len(drawn[20:])
+
+
+def test_without_density_control_nothing_waits_for_its_end() -> None:
+    settings = {"steps": 1000, "reset_every_fraction": 0.1, "ema_fraction": 0.1, "window_full_fraction": 0.0}
+    on, off = (
+        Schedule.from_config(small_config(**settings, refine_every_fraction=every, refine_stop_fraction=0.7))
+        for every in (0.01, 0.0)
+    )
+    assert [on.prunes_hidden(0), on.resets_at(100), on.averages_at(699), on.averages_at(701)] == [1, 1, 0, 1]
+    assert [off.prunes_hidden(0), off.resets_at(100), off.averages_at(699)] == [0, 0, 1]
 
 
 def test_phases_follow_each_other_and_cover_the_run() -> None:

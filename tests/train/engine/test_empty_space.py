@@ -51,3 +51,4 @@ def test_an_image_with_an_empty_border_shows_everything() -> None:
         cut = rgba.copy()
         cut[(*place, 3)] = 1
         assert not Target.over(cut, torch.zeros(3)).shows_all
+    assert not Target.over(np.zeros_like(rgba), torch.zeros(3)).shows_all, "all of it may be outside"

@@ -10,7 +10,16 @@ import pytest
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.cli import main as cli
 from msdgs_train.comparison import bench
-from msdgs_train.comparison.bench import COLUMNS, append_row, make_bench_runs, read_rows, read_scenes
+from msdgs_train.comparison.bench import (
+    COLUMNS,
+    KEY,
+    append_row,
+    key_of,
+    make_bench_runs,
+    read_rows,
+    read_scenes,
+    rows_of,
+)
 from msdgs_train.comparison.bench_report import as_markdown, paired_gain
 from msdgs_train.systems.registry import preset
 from tests.support.training_scene import write_scene
@@ -107,12 +116,26 @@ def test_the_table_has_means_over_scenes_that_all_have_and_gains_of_seeds_that_b
         row("s1", "a", 0, [20.0, 30.0]), row("s1", "a", 1, [22.0, 32.0]), row("s1", "b", 0, [23.0, 33.0]),
         row("s2", "a", 0, [10.0, 10.0]),
     ]  # fmt: skip
-    table = as_markdown(rows)
+    table = as_markdown(rows, ["a", "b"])
     assert "| s1 | 20.00 ± 0.00 | 20.00 | 26.00 ± 1.41 | 28.00 |" in table
     assert "| s2 | 20.00 | – | 10.00 | – |" in table
     assert "| mean | 20.00 | 20.00 | 26.00 | 28.00 |" in table
     assert "| s1 | +3.00 (+3.00 to +3.00) |" in table
     assert "| mean | +3.00 (+3.00 to +3.00) |" in table
+
+
+def test_gains_are_over_the_first_system_of_the_command_whichever_run_ended_first(data: Path) -> None:
+    runs = make_bench_runs({"a": preset("static"), "b": preset("static")}, read_scenes(data, short=True), (0, 1), data)
+    csv_file = data / "bench.csv"
+    for run in reversed(runs):
+        images = [20.0, 30.0] if run.system == "a" else [23.0, 33.0]
+        append_row(csv_file, row(run.scene, run.system, run.seed, images) | dict(zip(KEY, key_of(run), strict=True)))
+    rows = rows_of(runs, csv_file)
+    assert [(each["seed"], each["system"]) for each in rows] == [("0", "a"), ("0", "b"), ("1", "a"), ("1", "b")]
+    for some in (rows, rows[1:]):
+        table = as_markdown(some, ["a", "b"])
+        assert "Gain over a" in table
+        assert "| small | +3.00 (+3.00 to +3.00) |" in table
 
 
 def test_an_interval_covers_the_mean_gain() -> None:

@@ -22,6 +22,7 @@ from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine import run as fit_module
 from msdgs_train.engine.metrics_log import read_metrics, to_bytes
 from msdgs_train.engine.run import Observer, fit
+from msdgs_train.engine.run_record import stored_config
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation import evaluate as evaluation_module
 from msdgs_train.evaluation import report as evaluation_report
@@ -144,6 +145,18 @@ def test_a_resumed_run_knows_its_best(data: Path, tmp_path: Path) -> None:
     again = fit(small_config(steps=5), data, run, resume=True).best
     assert again is not None
     assert again.step == 5
+
+
+@pytest.mark.usefixtures("no_curve")
+def test_a_finished_run_can_be_evaluated_again_but_not_get_more_minutes(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    fit(small_config(steps=2), data, run)
+    before = read_metrics(run)
+    fit(small_config(steps=2), data, run, resume=True)
+    assert read_metrics(run) == before
+    with pytest.raises(InvalidInput, match=r"`config\.minutes` must be unchanged, as the run is finished"):
+        fit(small_config(steps=2, minutes=9.0), data, run, resume=True)
+    assert stored_config(run) == small_config(steps=2)
 
 
 def test_psnr_inside_a_mask_has_a_known_answer() -> None:
