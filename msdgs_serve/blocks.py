@@ -1,12 +1,14 @@
 """Frames in blocks by scene and time, which are drawn by this process or by workers on other machines."""
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import ImageFormat, encode
+from msdgs_serve.imaging.formats import default_channels
 from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera
 
@@ -40,7 +42,7 @@ class Block:
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """How frames are drawn and encoded."""
+    """How frames are drawn and encoded; their motion ends with the scene's time."""
 
     image_format: ImageFormat
     quality: int | None
@@ -67,8 +69,16 @@ def draw_block(
     block: Block, session: DeformationSession, renderer: Renderer, look: OutputOptions
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the number and the encoded file of each frame."""
+    channels, options = default_channels(look.image_format), look.options
+    if options.motion_dt is not None:
+        channels += ("motion",)
+    _, last = session.scene.metadata.time_range
     for number, camera, t in block.frames:
-        yield number, encode(renderer.render(session, camera, t, look.options), look.image_format, look.quality)
+        if look.options.motion_dt is not None:
+            left = math.nextafter(last - t, 0.0)  # rounded down, so that t + left isn't after the last time
+            options = replace(options, motion_dt=min(look.options.motion_dt, left))
+        image = renderer.render(session, camera, t, options)
+        yield number, encode(image, look.image_format, look.quality, channels)
 
 
 def _by_time(frame: Frame) -> tuple[float, int]:

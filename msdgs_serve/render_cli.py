@@ -7,6 +7,7 @@ import argparse
 import hashlib
 import itertools
 import json
+import math
 import os
 import shutil
 import sys
@@ -28,7 +29,7 @@ from msdgs_serve.imaging.encode import check_encodable
 from msdgs_serve.imaging.formats import default_channels
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
-from msdgs_serve.renderer import Renderer, RenderOptions
+from msdgs_serve.renderer import Renderer, RenderOptions, check_times
 from msdgs_serve.scene import InvalidInput, MsdgsError
 from msdgs_serve.video import VideoFormat, check_size, check_video, write_video
 
@@ -42,7 +43,7 @@ examples:
   msdgs-render scene.onnx frames/                           one turn around the scene over its time range, as PNG
   msdgs-render scene.onnx turn.mp4 --frames 96 --fps 24     the same as a video
   msdgs-render scene.onnx walk.webm --path camera_path.json a path saved by nerfstudio's viewer
-  msdgs-render scene.onnx frames/ --format exr              color, alpha and depth as numbers, for compositing
+  msdgs-render scene.onnx frames/ --format exr --dt 0.02    color, alpha, depth and motion vectors, for compositing
   msdgs-render views.json frames/                           a path whose cameras each name their "scene"
   msdgs-render scene.onnx frames/ --ray auto                on the Ray cluster of this machine, or at an address
 
@@ -85,6 +86,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--height", type=int, help="image height, pixels; required with --width")
     parser.add_argument("--format", choices=get_args(ImageFormat), default="png", help="format of images (default png)")
     parser.add_argument("--quality", type=int, help="quality of jpeg and webp, 1 to 100")
+    motion = "exr and npy also hold motion vectors from each frame's time to so much later, in the scene's time"
+    parser.add_argument("--dt", type=float, help=motion)
     parser.add_argument("--transparent", action="store_true", help="render images without a background")
     ray = "render on a Ray cluster: `auto` for that of this machine (started if there is none), or its address"
     parser.add_argument("--ray", metavar="ADDRESS", help=ray)
@@ -99,6 +102,8 @@ def _run(options: argparse.Namespace) -> None:
     views, fps = _views(options)
     image_format = cast(ImageFormat, "png" if is_video else options.format)
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
+    if options.dt is not None and (is_video or not FORMATS[image_format].holds_float):
+        raise InvalidInput("--dt", "left out, as only exr and npy hold motion vectors", options.dt)
     first = views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
     if is_video:
@@ -109,7 +114,7 @@ def _run(options: argparse.Namespace) -> None:
     _claim(folder, _record(options, views, image_format, transparent))
     files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(views))]
     background = "transparent" if transparent else "scene"
-    drawn = RenderOptions(background, depth="depth" in default_channels(image_format))
+    drawn = RenderOptions(background, motion_dt=options.dt, depth="depth" in default_channels(image_format))
     _draw(views, files, OutputOptions(image_format, options.quality, drawn), options.ray)
     if is_video:
         unfinished = options.out.with_name(f".{options.out.name}.part")
@@ -126,7 +131,7 @@ def _views(options: argparse.Namespace) -> tuple[list[View], float]:
         raise InvalidInput("--width", "given together with --height", "only one of them")
     if options.scene.suffix == ".json":
         return _views_of_scenes(options)
-    path = _path(options, DeformationSession(options.scene))
+    path = _path(options, _opened(options.scene, options))
     return [View(options.scene, camera, t) for camera, t in path.frames], path.fps
 
 
@@ -134,10 +139,19 @@ def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
     if options.path is not None:
         raise InvalidInput("--path", "left out if the first argument is a camera path", options.path)
     scenes = [options.scene.parent / name for name in read_scene_names(options.scene)]
-    ranges = {scene: DeformationSession(scene).scene.metadata.time_range for scene in dict.fromkeys(scenes)}
+    ranges = {scene: _opened(scene, options).scene.metadata.time_range for scene in dict.fromkeys(scenes)}
     paths = {scene: read_path_file(options.scene, time_range, _size(options)) for scene, time_range in ranges.items()}
     views = [View(scene, *paths[scene].frames[number]) for number, scene in enumerate(scenes)]
     return views, _fps(options, paths[scenes[0]].fps)
+
+
+def _opened(scene: Path, options: argparse.Namespace) -> DeformationSession:
+    session = DeformationSession(scene)
+    if options.dt is not None:
+        if not 0 < options.dt < math.inf:
+            raise InvalidInput("--dt", "above 0", options.dt)
+        check_times(session, session.scene.metadata.time_range[0], motion_dt=0.0)
+    return session
 
 
 def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPath:
@@ -227,6 +241,7 @@ def _record(options: argparse.Namespace, views: Sequence[View], image_format: st
         digest.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, t)).encode())
         digest.update(camera.camera_to_world.tobytes())
     asked = {"format": image_format, "quality": options.quality, "transparent": transparent}
+    asked |= {} if options.dt is None else {"dt": options.dt}
     return json.dumps({**asked, "sha256": digest.hexdigest()})
 
 

@@ -10,11 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msdgs_serve.blocks import MAX_FRAMES, View, plan_blocks
-from msdgs_serve.camera_path import read_scene_names
+from msdgs_serve.camera_path import orbit_path, read_scene_names
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import framing
 from msdgs_serve.render_cli import main
+from msdgs_serve.renderer import Renderer, RenderOptions
 from msdgs_serve.scene import Camera, InvalidInput
 from tests.frames.test_video import nerfstudio
 from tests.support.scene_files import write_scene
+from tests.support.tolerances import assert_close
 
 CAMERA = Camera.from_fov(np.eye(4), 8, 8, 40.0)
 SCENES = [Path("a.onnx"), Path("b.onnx")]
@@ -67,6 +71,32 @@ def test_a_path_through_several_scenes_draws_each_frame_of_its_own(folder: Path)
         for number in numbers:
             frame = f"frame_{number:05d}.png"
             assert (folder / "out" / frame).read_bytes() == (alone / frame).read_bytes()
+
+
+def test_motion_vectors_end_with_the_scenes_time(folder: Path):
+    out, file = folder / "out", folder / "two.onnx"  # times in [0, 0.5]
+    command = [str(file), str(out), "--frames", "6", "--width", "16", "--height", "16", "--format", "npy"]
+    assert main([*command, "--dt", "0.15"]) == 0
+    frames = [np.load(out / f"frame_{number:05d}.npy") for number in range(6)]
+    assert {frame.shape for frame in frames} == {(16, 16, 7)}
+    assert np.abs(frames[0][..., 5:]).max() > 0
+    assert not frames[5][..., 5:].any(), "nothing moves afterwards"
+    session = DeformationSession(file)
+    view = framing(session.scene.metadata)
+    path = orbit_path(view.target, view.distance, 20.0, view.up, view.fov_y, (16, 16), 6, (0.0, 0.5))
+    for (camera, t), frame, dt in zip(path[1::3], frames[1::3], (0.15, 0.1), strict=True):
+        expected = Renderer().render(session, camera, t, RenderOptions("transparent", motion_dt=dt)).motion
+        assert expected is not None
+        assert_close(frame[..., 5:], expected, "motion_vector")
+
+
+@pytest.mark.parametrize(("dt", "image_format"), [("0", "exr"), ("nan", "exr"), ("0.1", "png")])
+def test_motion_that_cannot_be_is_refused_before_drawing(
+    folder: Path, dt: str, image_format: str, capsys: pytest.CaptureFixture[str]
+):
+    assert main([str(folder / "one.onnx"), str(folder / "out"), "--format", image_format, "--dt", dt]) == 2
+    assert "`--dt` must be" in capsys.readouterr().err
+    assert not (folder / "out").exists()
 
 
 @pytest.mark.parametrize("fps", ["nan", "0", "-1"])
