@@ -2,9 +2,15 @@
 
 const KEY = "msdgs-key";
 
-export class Unreachable extends Error {}
+export class Unreachable extends Error {
+  message = "The service doesn’t answer. Trying again…";
+  retryAfter = 1;
+}
 
-/** An error response; `detail` is for people, `fields` are the invalid fields of the request. */
+/**
+ * An error response; `detail` is for people, `fields` are the invalid fields of the request. `retryAfter`, seconds, is
+ * null if only another request or another file can help.
+ */
 export class Refusal extends Error {
   constructor(status, problem, retryAfter) {
     super(problem.detail ?? `The service answered ${status}.`);
@@ -33,9 +39,11 @@ export async function call(path, { headers = {}, ...options } = {}) {
     throw new Unreachable();
   }
   if (response.ok || response.status === 304) return response;
-  if (response.status === 502) throw new Unreachable(); // a proxy that doesn't reach the service
-  const problem = await response.json().catch(() => ({}));
-  throw new Refusal(response.status, problem, Number(response.headers.get("Retry-After")) || 1);
+  const problem = await response.json().catch(() => null);
+  const isOfProxy = response.status === 502 || (response.status === 503 && !problem);
+  if (isOfProxy) throw new Unreachable(); // the proxy doesn't reach the service
+  const wait = response.headers.get("Retry-After");
+  throw new Refusal(response.status, problem ?? {}, wait && (Number(wait) || 1));
 }
 
 export const scenePath = (name) => `scenes/${encodeURIComponent(name)}`;

@@ -9,16 +9,21 @@ const DEGREES = 180 / Math.PI;
 export class Camera {
   /** `view` is `view` of GET /scenes/{name}. */
   constructor(view) {
+    this.aspect = 1; // width / height of the image; set by the stage
+    this.setView(view);
+    this.reset();
+  }
+
+  /** Replace the scene's view, and keep the angles and the target. */
+  setView(view) {
     this.view = view;
     this.up = unit(view.up);
-    this.aspect = 1; // width / height of the image; set by the stage
     // azimuth 0 is the world axis most perpendicular to `up`, as in the service
     const tilts = this.up.map(Math.abs);
     const axis = [0, 0, 0];
     axis[tilts.indexOf(Math.min(...tilts))] = 1;
     this.level = unit(add(axis, this.up, -dot(axis, this.up)));
     this.side = cross(this.up, this.level);
-    this.reset();
   }
 
   reset() {
@@ -38,7 +43,8 @@ export class Camera {
     const inFront = dot(add(this.view.target, eye, -1), forward);
     this.distance = Math.max(inFront, 0.1 * this.view.distance);
     this.target = add(eye, forward, this.distance);
-    this.elevation = limited(-Math.asin(dot(forward, this.up)) * DEGREES);
+    const rise = Math.min(Math.max(dot(forward, this.up), -1), 1); // rounding may exceed the range of a sine
+    this.elevation = limited(-Math.asin(rise) * DEGREES);
     this.azimuth = Math.atan2(-dot(forward, this.side), -dot(forward, this.level)) * DEGREES;
     this.fovY = 2 * Math.atan(sceneCamera.height / (2 * sceneCamera.fy)) * DEGREES;
     this.proportion = sceneCamera.width / sceneCamera.height;

@@ -1,6 +1,6 @@
 // Connection state: a banner while the service doesn't answer, and reconnection.
 
-import { Refusal, Unreachable, call } from "./api.js";
+import { Refusal, call } from "./api.js";
 
 const SHORTEST_WAIT = 1000;
 const MAX_WAIT = 5000;
@@ -18,8 +18,7 @@ export class Connection {
 
   /** Show an error, and retry later if that can help. */
   failed(error) {
-    if (error instanceof Unreachable) this.#lose("The service doesn’t answer. Trying again…");
-    else if (error instanceof Refusal && error.status === 503) this.#lose(error.message, error.retryAfter * 1000);
+    if (error.retryAfter) this.#lose(error.message, error.retryAfter * 1000);
     else if (error instanceof Refusal && error.status === 401) {
       this.say("The service asks for a key.");
       this.keyNeeded();
@@ -31,7 +30,7 @@ export class Connection {
     this.banner.hidden = !text;
   }
 
-  #lose(text, wait = SHORTEST_WAIT) {
+  #lose(text, wait) {
     this.say(text);
     if (this.isLost) return;
     this.isLost = true;
@@ -47,7 +46,7 @@ export class Connection {
     try {
       await call("ready");
     } catch (error) {
-      if (error instanceof Refusal) this.say(error.message);
+      this.say(error.message);
       this.#tryAfter(Math.min(wait * GROWTH, MAX_WAIT));
       return;
     }

@@ -19,7 +19,7 @@ export function showFacts(list, scene) {
   list.replaceChildren(...shown.flatMap(([term, value]) => [element("dt", term), element("dd", value)]));
 }
 
-/** Return the largest error of the means; plans other than `network` measure it in scene units. */
+/** Return the largest error of the means, in scene units if the exporter measured it so. */
 function largestError({ position, means }) {
   if (position !== undefined) return `at most ${position.toExponential(1)} scene units`;
   return means === undefined ? "" : `at most ${means.toExponential(1)} of the scene’s size`;

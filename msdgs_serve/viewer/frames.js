@@ -1,10 +1,9 @@
 // Requests frames one at a time: small ones during motion, a full one after it.
 // A full frame in progress is aborted when something moves, and the service cancels its render.
 
-import { Refusal, Unreachable, render } from "./api.js";
+import { Refusal, render } from "./api.js";
 
 const FULL_AFTER = 150; // milliseconds
-const ABORT_AFTER = 500; // milliseconds after which an outdated frame is aborted during motion
 const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
 const MIN_PIXELS = 64 * 64;
 
@@ -29,8 +28,7 @@ export class Frames {
     this.changedAt = performance.now();
     this.wanted = true;
     this.shown = null;
-    const flight = this.inFlight;
-    if (flight && (cut || flight.full || performance.now() - flight.asked > ABORT_AFTER)) flight.abort.abort();
+    if (this.inFlight && (cut || this.#givesUp(this.inFlight))) this.inFlight.abort.abort();
     this.#next();
   }
 
@@ -49,6 +47,10 @@ export class Frames {
 
   #isMoving() {
     return this.host.isMoving() || performance.now() - this.changedAt < FULL_AFTER;
+  }
+
+  #givesUp({ full, pixels, asked }) {
+    return full || this.pace.givesUp(pixels, (performance.now() - asked) / 1000);
   }
 
   #next() {
@@ -72,7 +74,7 @@ export class Frames {
     const size = full ? this.fullSize() : this.pace.size(this.fullSize());
     const body = { ...this.host.body(), ...size, ...(full ? { format: "png" } : { format: "jpeg", quality: 85 }) };
     const abort = new AbortController();
-    this.inFlight = { abort, full, asked: performance.now() };
+    this.inFlight = { abort, full, pixels: size.width * size.height, asked: performance.now() };
     try {
       const response = await render(body, { signal: abort.signal, etag });
       if (response.status !== 304) await this.#show(response, size, full, etag !== undefined);
@@ -85,13 +87,13 @@ export class Frames {
   }
 
   async #show(response, size, full, isNews) {
-    const { asked, abort } = this.inFlight;
+    const { pixels, asked, abort } = this.inFlight;
     const bitmap = await createImageBitmap(await response.blob());
     if (abort.signal.aborted) return;
     await new Promise(requestAnimationFrame);
     const seconds = (performance.now() - asked) / 1000;
     const stages = timings(response.headers.get("Server-Timing"));
-    if (!full) this.pace.measured(size.width * size.height, seconds, (stages.draw ?? 0) + (stages.encode ?? 0));
+    if (!full) this.pace.measured(pixels, seconds, (stages.draw ?? 0) + (stages.encode ?? 0));
     this.host.show(bitmap, { ...size, full, seconds, stages, isNews });
     bitmap.close();
     this.refused = false;
@@ -108,7 +110,7 @@ export class Frames {
       this.wanted = true;
       return;
     }
-    if (error instanceof Unreachable || error.status === 503) {
+    if (error.retryAfter) {
       this.wanted = true;
       this.paused = true;
     } else {

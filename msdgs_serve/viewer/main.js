@@ -58,9 +58,11 @@ async function open(name, look = {}) {
     state.camera.aspect = stage.aspect();
     state.player.seek(0);
     layers.set(null);
-  }
-  if (state.camera.sceneCamera >= scene.cameras.length) state.camera.sceneCamera = null;
+  } else state.camera.setView(scene.view);
   layers.open(scene.steps);
+  const { sceneCamera } = state.camera;
+  state.camera.sceneCamera = null; // unless the file still has it, maybe with another pose
+  applyLook({ sceneCamera });
   applyLook(look);
   describe();
   connection.say("");
@@ -74,9 +76,10 @@ async function reopen() {
   if (!opening) await open(state.scene.name);
 }
 
-function applyLook({ t = null, steps = null, at = null, sceneCamera = null, view = null }) {
+function applyLook({ t = null, steps, at = null, sceneCamera = null, view = null }) {
   if (t !== null) state.player.seekTime(t);
-  if (steps !== null) layers.set(steps);
+  if (steps !== undefined) layers.set(steps); // null in an address without them: all
+  if (at) state.camera.reset();
   if (at) [state.camera.azimuth, state.camera.elevation, state.camera.distance] = at;
   if (at) state.camera.target = at.slice(3);
   if (sceneCamera in state.scene.cameras) state.camera.take(state.scene.cameras[sceneCamera], sceneCamera);

@@ -1,5 +1,6 @@
 // Chooses the size of frames during motion from the measured times of earlier frames.
 
+const PATIENCE = 0.5; // seconds of drawing after which an outdated frame is given up for a smaller one
 const TARGET = 1 / 18; // seconds per frame: 15 frames per second with a margin
 const MIN_PIXELS = 128 * 96;
 const DRAWING_SHARE = 0.3; // minimal fraction of the target for drawing, even if posing takes longer
@@ -23,6 +24,14 @@ export class Pace {
     this.rest += SMOOTHING * (seconds - drawing - this.rest);
   }
 
+  /** Record that an outdated frame isn't there after `seconds`. Return whether a smaller one should replace it. */
+  givesUp(pixels, seconds) {
+    const drawing = seconds - this.rest;
+    if (pixels <= MIN_PIXELS || drawing <= PATIENCE) return false;
+    this.measured(pixels, seconds, drawing);
+    return true;
+  }
+
   /** Return a size with the aspect ratio of `full`, and at most `full`. */
   size(full) {
     const all = full.width * full.height;
@@ -40,4 +49,4 @@ export class Pace {
 /** Quantize the scale, so that the sharpness doesn't flicker. */
 const steps = (scale) => (scale >= 1 ? 1 : 2 ** (Math.floor(4 * Math.log2(scale)) / 4));
 
-const sized = (pixels) => Math.max(1, Math.round(pixels));
+const sized = (pixels) => Math.max(1, Math.floor(pixels)); // at most MIN_PIXELS in all for the smallest

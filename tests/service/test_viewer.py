@@ -15,15 +15,15 @@ from playwright.sync_api import Browser, Page, Route
 
 from msdgs_serve.api.routes.viewer import FILES, FOLDER
 from msdgs_serve.imaging import ImageFormat
+from tests.service.conftest import MILLISECONDS, open_page
 from tests.support.images import decode
-from tests.support.processes import bodies, chromium, forget, image, wait_for, wait_until_still
+from tests.support.processes import bodies, forget, image, wait_for, wait_until_still
 from tests.support.scene_files import metadata, write_scene
 from tests.support.service import serving
 
 pytestmark = pytest.mark.slow
 
 KEY = "0123456789abcdef"
-MILLISECONDS = 60_000
 REPORT = {
     "format": "msdgs-report/1",
     "checkpoint_sha256": "0" * 64,
@@ -52,31 +52,6 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def client(scenes: Path) -> Iterator[httpx.Client]:
     with serving(scenes) as client:
         yield client
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as browser:
-        yield browser
-
-
-@pytest.fixture
-def page(browser: Browser) -> Iterator[Page]:
-    """Yield an empty page; fail if its console shows an error other than a request that found no service."""
-    with browser.new_context(viewport={"width": 820, "height": 420}, reduced_motion="reduce") as context:
-        page = context.new_page()
-        page.set_default_timeout(MILLISECONDS)
-        complaints: list[str] = []
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", lambda line: complaints.append(line.text) if line.type in ("error", "warning") else None)
-        yield page
-        assert [text for text in complaints if not text.startswith("Failed to load resource")] == []
-
-
-def open_page(page: Page, client: httpx.Client, address: str = "#scene=balls") -> Page:
-    page.goto(f"{client.base_url}/{address}")
-    wait_until_still(page)
-    return page
 
 
 @pytest.fixture

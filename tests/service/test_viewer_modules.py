@@ -52,6 +52,18 @@ def test_a_pose_from_the_scene_is_kept(modules: Page):
     assert np.abs(columns - stored.camera.camera_to_world[:3]).max() < tolerance("rotation")
 
 
+def test_a_stored_camera_may_look_straight_down(modules: Page):
+    script = """async ([view, stored]) => {
+        const { Camera } = await import("/viewer/camera.js");
+        const camera = new Camera(view);
+        camera.take(stored, 0);
+        return [camera.elevation, ...camera.target]; }"""
+    view = {"target": [0.5, 0, 0.25], "distance": 3, "up": [0, 0, 1], "fov_y": 40, "width": 4, "height": 3}
+    rounded = [[1, 0, 0, 0.5], [0, -1, 0, 0], [0, 0, -1.0000001, 3.25], [0, 0, 0, 1]]
+    stored = {"camera_to_world": rounded, "width": 4, "height": 3, "fy": 4}
+    assert modules.evaluate(script, [view, stored]) == pytest.approx([89, *view["target"]], abs=1e-5)
+
+
 @pytest.mark.parametrize("size", [0, 1e-15, 1, 1e6])
 def test_the_range_of_depths_has_an_extent(modules: Page, size: float):
     script = """async ([view, bounds]) => {
@@ -109,3 +121,40 @@ def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nano
     assert seconds < 1 / 15
     affordable = (1 / 15 - pose) / (nanoseconds_per_pixel * 1e-9)
     assert pixels > 0.5 * min(affordable, 1600 * 1200), "fewer pixels than affordable"
+
+
+@pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.0, 2500.0), (0.0, 100_000.0), (0.6, 20.0)])
+def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: float, nanoseconds_per_pixel: float):
+    """The clock is simulated: at first a frame of 600 x 400 pixels takes at least 0.6 s."""
+    script = """async ([pose, aPixel]) => {
+        const { Frames } = await import("/viewer/frames.js");
+        const { Pace } = await import("/viewer/pace.js");
+        window.taken = [];
+        window.createImageBitmap = async () => ({ close() {} });
+        window.fetch = (_, { body, signal }) => new Promise((answer, reject) => {
+          const { width, height } = JSON.parse(body);
+          const drawing = width * height * aPixel;
+          const headers = new Headers({ "Server-Timing": `draw;dur=${1000 * drawing}` });
+          signal.addEventListener("abort", () => reject(signal.reason));
+          setTimeout(() => answer({ ok: true, headers, blob: async () => null }), 1000 * (pose + drawing));
+        });
+        const host = {
+          size: () => ({ width: 1200, height: 800 }),
+          body: () => ({}),
+          isMoving: () => true,
+          show: (_, { seconds }) => taken.push(seconds),
+        };
+        const frames = new Frames(host, new Pace());
+        frames.paused = false;
+        const tick = () => (frames.change(), requestAnimationFrame(tick));
+        tick(); }"""
+    page = modules.context.new_page()
+    page.clock.install(time=0)
+    page.goto(modules.url)
+    page.clock.pause_at(1000)
+    page.evaluate(script, [pose, nanoseconds_per_pixel * 1e-9])
+    page.clock.run_for(10_000)
+    taken = page.evaluate("taken")
+    smallest = pose + 128 * 96 * nanoseconds_per_pixel * 1e-9
+    assert taken[-1] < max(1 / 15, smallest + 1 / 30)
+    assert sum(taken) > 8, "hardly a frame came after the first ones"
