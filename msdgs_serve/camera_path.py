@@ -84,7 +84,10 @@ def read_nerfstudio(
         if not 0 < fov_y < 180:
             raise InvalidInput(f"{name}.fov", "in (0, 180) degrees", fov_y)
         focal = 0.5 * height / math.tan(0.5 * math.radians(fov_y))
-        camera = Camera.from_opengl(pose, width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+        try:
+            camera = Camera.from_opengl(pose, width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
+        except InvalidInput as error:
+            raise error.renamed(error.field.replace("camera", name, 1)) from None
         frames.append((camera, _time(each, even[number], time_range, name)))
     return CameraPath(tuple(frames), _fps(document))
 

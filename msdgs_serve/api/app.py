@@ -16,6 +16,7 @@ from msdgs_serve.api.routes import batch, health, render, scenes, video, viewer
 from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.renderer import Renderer
+from msdgs_serve.scene import InvalidInput
 from msdgs_serve.store import SceneStore
 
 DESCRIPTION = """Frames of dynamic Gaussian scenes, for any camera and any time.
@@ -32,8 +33,10 @@ EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *FRAME_HEADERS, "Retry-A
 def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> FastAPI:
     """Return the application that serves the scenes of `store`.
 
-    Raises `InvalidInput` if the file of API keys is invalid.
+    Raises `InvalidInput` if the file of API keys is invalid, or if there is no folder for uploads.
     """
+    if settings.uploads and store.folder is None:
+        raise InvalidInput("uploads", "given with a folder, to which scenes are added", "only files")
     keys = None if settings.api_keys_file is None else read_keys(settings.api_keys_file)
     service = Service(store, renderer, settings)
     app = FastAPIOffline(title="msdgs", version=__version__, description=DESCRIPTION, lifespan=service.lifespan)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 
 from pydantic import ValidationError
+from pydantic_settings import SettingsError
 
 from msdgs_serve.api.app import create_app
 from msdgs_serve.api.observe import JsonLines
@@ -53,11 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _settings(arguments: Sequence[str]) -> Settings:
     try:
-        settings = Settings(_cli_parse_args=list(arguments))  # pyright: ignore[reportCallIssue]
+        settings = Settings.from_arguments(arguments)
     except ValidationError as error:
         errors = [item for item in error.errors() if item["type"] != "default_factory_not_called"]  # follows another
         wrong = [f"--{item['loc'][0]}: {item['msg']}".replace("_", "-") for item in errors]
         raise UsageError("; ".join(wrong)) from None
+    except SettingsError as error:
+        raise UsageError(str(error)) from None
     if not (settings.scenes or settings.compile):
         raise UsageError(f"no scene given; `{PROGRAM} scene.onnx` serves one, see `{PROGRAM} --help`")
     return settings

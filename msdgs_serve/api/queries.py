@@ -31,6 +31,14 @@ def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:
         raise InvalidInput(_parameter(first["loc"]), f"as in POST /render ({first['msg']})", "another value") from None
 
 
+def by_parameter(error: InvalidInput) -> InvalidInput:
+    """Return an error of the request with the parameters in place of its fields, also in the text."""
+    field, expected = (
+        text.replace("camera.name", "camera").replace("camera.", "") for text in (error.field, error.expected)
+    )
+    return InvalidInput(field, expected, error.got)
+
+
 def _camera(given: dict[str, Any]) -> dict[str, Any]:
     by_name, orbit = [name for name in ("camera", "index") if name in given], [n for n in ORBIT_FIELDS if n in given]
     if by_name:

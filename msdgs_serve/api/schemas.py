@@ -209,8 +209,8 @@ class RenderRequest(Strict):
     background: Background = Field(
         default="auto",
         description="`scene`: the background color of training. `transparent` or null: none, and the frame "
-        "has an alpha channel (not in `jpeg`). `[r, g, b]`: sRGB-encoded, 0 to 1. `auto`: `transparent` for `exr`, "
-        "`scene` for the others. An opaque frame has no alpha, or alpha 1 in `exr`",
+        "has an alpha channel (not in `jpeg`). `[r, g, b]`: sRGB-encoded, 0 to 1. `auto`: `transparent` for `exr` "
+        "and `npy`, `scene` for the others. An opaque frame has no alpha, or alpha 1 in `exr` and `npy`",
     )
 
 

@@ -151,14 +151,14 @@ class Service:
 
     def _refresh(self) -> None:
         try:
-            if self.settings.uploads:
-                self.store.clear_incoming()
             self.store.refresh()
             problems = {each.name: str(each.problem) for each in self.store.statuses() if each.problem}
             for name, problem in problems.items():
                 if self._reported.get(name) != problem:
                     logger.error("%s", problem)
             self._reported = problems
+            if self.settings.uploads:
+                self.store.clear_incoming()
         except Exception:
             logger.exception("refreshing the scenes failed")
 

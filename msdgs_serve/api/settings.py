@@ -1,6 +1,9 @@
 """Settings of the service, from flags and from the environment."""
 
+import json
 import os
+from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +14,7 @@ from pydantic_settings import (
     BaseSettings,
     CliImplicitFlag,
     CliPositionalArg,
+    CliSettingsSource,
     EnvSettingsSource,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
@@ -127,6 +131,12 @@ class Settings(BaseSettings):
         default="warning", description="`info` logs every request and invalid upload"
     )
 
+    @classmethod
+    def from_arguments(cls, arguments: Sequence[str]) -> "Settings":
+        """Return the settings of a command line. Raises pydantic's `ValidationError`, and `SettingsError`."""
+        flags = CliSettingsSource(cls, cli_parse_args=list(arguments), case_sensitive=False, parse_args_method=_parse)
+        return cls(_cli_settings_source=flags)  # pyright: ignore[reportCallIssue]
+
     @property
     def graph_limits(self) -> GraphLimits:
         """Limits of a scene's cost."""
@@ -143,6 +153,15 @@ class Settings(BaseSettings):
     ) -> tuple[PydanticBaseSettingsSource, ...]:
         """Return the sources in order: flags (first in pydantic-settings), arguments, environment."""
         return init_settings, _Environment(settings_cls)
+
+
+def _parse(parser: ArgumentParser, arguments: Sequence[str] | None, namespace: Any) -> Namespace:
+    """Parse the command line. Paths become JSON, as pydantic-settings gives commas, brackets and quotes in other lists
+    a meaning."""
+    parsed = parser.parse_args(arguments, namespace)
+    if isinstance(parsed.scenes, list):
+        parsed.scenes = json.dumps(parsed.scenes)
+    return parsed
 
 
 class _Environment(EnvSettingsSource):

@@ -17,6 +17,12 @@ class InvalidInput(MsdgsError, ValueError):
     def __init__(self, field: str, expected: str, got: object) -> None:
         super().__init__(f"`{field}` must be {expected}, got {got}")
         self.field = field
+        self.expected = expected
+        self.got = got
+
+    def renamed(self, field: str) -> "InvalidInput":
+        """Return the error with another name of the field, such as its place in a whole request."""
+        return InvalidInput(field, self.expected, self.got)
 
 
 class SceneNotFound(MsdgsError, KeyError):

@@ -86,6 +86,8 @@ def test_help_shows_examples_and_options(capsys: pytest.CaptureFixture[str]):
         (["balls.onnx", "--port", "70000"], "--port: "),
         (["balls.onnx", "--max-pixels", "many"], "--max-pixels: "),
         (["balls.onnx", "--host", "256.1.1.1"], "can't listen on 256.1.1.1"),
+        (["balls.onnx", "--host", "256.1.1.1", "--uploads"], "`uploads` must be given with a folder"),
+        (["balls.onnx", "--cors-origins", "["], "cors_origins: "),
     ],
 )
 def test_errors_are_one_line(
@@ -142,8 +144,14 @@ def test_flags_win_over_the_environment(scene: Path, tmp_path: Path, monkeypatch
     monkeypatch.setenv("MSDGS_SCENES", f"{scene}:{tmp_path}")
     monkeypatch.setenv("MSDGS_PORT", "9000")
     monkeypatch.setenv("MSDGS_MAX_PIXELS", "500")
-    settings = Settings(_cli_parse_args=["--port", "9001"])  # pyright: ignore[reportCallIssue]
+    settings = Settings.from_arguments(["--port", "9001"])
     assert settings.scenes == [scene, tmp_path]
     assert (settings.port, settings.max_pixels) == (9001, 500)
-    settings = Settings(_cli_parse_args=["other.onnx"])  # pyright: ignore[reportCallIssue]
+    settings = Settings.from_arguments(["other.onnx"])
     assert settings.scenes == [Path("other.onnx")]
+
+
+def test_any_path_is_one_scene():
+    paths = [Path(name) for name in ("a,b.onnx", "[x].onnx", "{y", 'it"s.onnx', "it's.onnx", "3", " c\\", "null")]
+    settings = Settings.from_arguments([str(path) for path in paths])
+    assert settings.scenes == paths

@@ -22,11 +22,13 @@ from tests.support.service import ORBIT, check_problem, eventually, in_this_proc
 
 SIZE = 48
 FRAME = {"camera": {**ORBIT, "distance": 5, "fov_y": 40}, "t": 0.5, "width": SIZE, "height": SIZE}
+FILM_FRAME = {"camera": ORBIT, "t": 0.5}
+PIXELS = {"type": "matrix", "camera_to_world": np.eye(4).tolist(), "fx": 9}
 
 
 @pytest.fixture(scope="module")
 def client(scene: Path) -> Iterator[httpx.Client]:
-    with serving(scene, max_samples=16, max_batch=8) as client:
+    with serving(scene, max_samples=16, max_batch=8, max_video_frames=3) as client:
         yield client
 
 
@@ -130,10 +132,39 @@ def test_get_equals_post(client: httpx.Client):
         ("channels=smell", "channels"),
         ("surprise=1", "surprise"),
         ("elevation=90", "elevation"),
+        ("index=99", "index"),
+        ("camera=nope", "camera"),
+        ("camera=view_0&index=1", "index"),
+        ("eye=1,0,0&target=1,0,0", "target"),
     ],
 )
 def test_an_invalid_query_is_refused_by_parameter(client: httpx.Client, query: str, field: str):
-    check_problem(client.get(f"/render?{query}"), 422, field)
+    response = client.get(f"/render?{query}")
+    check_problem(response, 422, field)
+    assert "camera." not in response.text
+
+
+def camera_path(*scales: float, **size: int) -> dict[str, Any]:
+    """A camera path in nerfstudio's format; poses of another scale than 1 are invalid."""
+    cameras = [{"camera_to_world": np.diag([scale, scale, scale, 1.0]).ravel().tolist(), "fov": 40} for scale in scales]
+    return {"camera_path": cameras, **size}
+
+
+@pytest.mark.parametrize(
+    ("body", "field"),
+    [
+        ({"frames": [FILM_FRAME, {**FILM_FRAME, "camera": {"type": "scene", "index": 99}}]}, "frames.1.camera.index"),
+        ({"frames": [FILM_FRAME, {**FILM_FRAME, "t": 2}]}, "frames.1.t"),
+        ({"frames": [{**FILM_FRAME, "camera": PIXELS}]}, "width"),
+        ({"frames": [FILM_FRAME] * 4}, "frames"),
+        ({"path": camera_path(1, 2, render_width=9, render_height=9)}, "path.camera_path.1.camera_to_world"),
+        ({"path": camera_path(1, render_width=9)}, "path.render_height"),
+        ({"path": camera_path(1, 1, 1, 1), "width": 9, "height": 9}, "path.camera_path"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_an_invalid_video_is_refused_by_field(client: httpx.Client, body: dict[str, Any], field: str):
+    check_problem(client.post("/render/video", json=body), 422, field)
 
 
 def test_several_times_are_several_files(client: httpx.Client):

@@ -1,16 +1,21 @@
 """Uploads and deletions of scenes: each is complete or has no effect, and only valid scenes are stored."""
 
+import asyncio
 import hashlib
 import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import numpy as np
 import pytest
+from starlette.requests import Request
 
+from msdgs_serve.api.routes import scenes
+from msdgs_serve.store import SceneStore
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, check_problem, connect, eventually, in_this_process, own_connection, serving
@@ -125,6 +130,32 @@ def test_old_files_of_a_killed_process_are_removed(folder: Path):
     with serving(folder, uploads=True) as client:
         assert client.get("/scenes").json()["scenes"][0]["name"] == "walk"
         eventually(lambda: files(folder) == [".incoming-new", "walk.onnx"])
+
+
+@in_this_process
+def test_files_are_reloaded_where_old_ones_cannot_be_removed(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(SceneStore, "clear_incoming", Mock(side_effect=PermissionError))
+    write_scene(folder / "walk.onnx")
+    with serving(folder, uploads=True) as client:
+        assert client.post("/render", json=FRAME).status_code == 200
+        blue = write_scene(folder / "walk.onnx", static_color=(0, 0, 1)).read_bytes()
+        eventually(lambda: client.get("/scenes/walk").json()["sha256"] == hashlib.sha256(blue).hexdigest())
+
+
+def test_the_time_limit_of_a_part_leaves_out_the_time_to_write_it():
+    messages = [{"type": "http.request", "body": each, "more_body": each != b"scene"} for each in (b"a ", b"scene")]
+
+    async def receive() -> dict[str, Any]:
+        return messages.pop(0)
+
+    async def received() -> bytes:
+        parts = []
+        async for part in scenes._parts(Request({"type": "http"}, receive), seconds=0):
+            await asyncio.sleep(0)
+            parts.append(part)
+        return b"".join(parts)
+
+    assert asyncio.run(received()) == b"a scene"
 
 
 def test_a_file_that_is_removed_while_it_is_received_is_asked_for_again(

@@ -10,11 +10,12 @@ from fastapi.responses import Response
 
 from msdgs_serve.api.frames import FramePlan, IfNoneMatch, draw_plan, is_unchanged, plan_frame, server_timing
 from msdgs_serve.api.openapi import IMAGE_RESPONSE, NOT_MODIFIED, problems
-from msdgs_serve.api.queries import request_of
+from msdgs_serve.api.queries import by_parameter, request_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
 from msdgs_serve.render_job import RenderJob
+from msdgs_serve.scene import InvalidInput
 
 RESPONSES = {**IMAGE_RESPONSE, **NOT_MODIFIED, **problems(400, 404, 408, 413, 422, 503, 504)}
 
@@ -43,8 +44,11 @@ async def render_link(
     """The same for browsers and proxies: `/render?azimuth=30&t=0.5`. The default camera is an orbit view."""
 
     def plan() -> FramePlan:
-        metadata = service.scene(query.scene).session.scene.metadata
-        return plan_frame(service, request_of(query, metadata))
+        body = request_of(query, service.scene(query.scene).session.scene.metadata)
+        try:
+            return plan_frame(service, body)
+        except InvalidInput as error:
+            raise by_parameter(error) from None
 
     return await answer(service, request, plan, if_none_match)
 

@@ -1,7 +1,7 @@
 """Render a video along a camera path."""
 
-from collections.abc import AsyncGenerator
-from contextlib import aclosing
+from collections.abc import AsyncGenerator, Iterator
+from contextlib import aclosing, contextmanager
 from functools import partial
 from typing import BinaryIO, cast
 
@@ -95,29 +95,36 @@ async def _joined(first: bytes, rest: AsyncGenerator[bytes]) -> AsyncGenerator[b
 
 def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath]:
     scene = service.scene(body.scene)
-    metadata = scene.session.scene.metadata
     if (body.frames is None) == (body.path is None):
         raise InvalidInput("frames", "given, or path", "neither" if body.frames is None else "both")
     if (body.width is None) != (body.height is None):
         raise InvalidInput("width", "given together with height", "only one of them")
     size = None if body.width is None or body.height is None else (body.width, body.height)
     if body.path is not None:
-        path = read_nerfstudio(body.path.model_dump(exclude_none=True), metadata.time_range, size)
+        with _named_in("path"):
+            times = scene.session.scene.metadata.time_range
+            path = read_nerfstudio(body.path.model_dump(exclude_none=True), times, size)
     else:
-        width, height, given = body.width, body.height, body.frames or ()
-        requests = [RenderRequest(camera=each.camera, t=each.t, width=width, height=height) for each in given]
-        first = resolve_camera(requests[0], scene)
-        asked = {"width": first.width, "height": first.height}
-        cameras = [resolve_camera(each.model_copy(update=asked), scene) for each in requests]
-        path = CameraPath(tuple(zip(cameras, [each.t for each in given], strict=True)), DEFAULT_FPS)
-    if len(path.frames) > service.settings.max_video_frames:
-        raise InvalidInput("frames", f"at most {service.settings.max_video_frames}", len(path.frames))
-    camera = path.frames[0][0]
-    check_pixels(camera, len(path.frames), service.settings.max_pixels, service.settings.max_video_pixels, "frames")
-    for number, (_, t) in enumerate(path.frames):
-        try:
-            check_times(scene.session, t)
-        except InvalidInput as error:
-            first, last = metadata.time_range
-            raise InvalidInput(f"frames.{number}.t", f"in the scene's range [{first}, {last}]", t) from error
+        width, height, frames = body.width, body.height, []
+        for number, each in enumerate(body.frames or ()):
+            with _named_in(f"frames.{number}"):
+                check_times(scene.session, each.t)
+                request = RenderRequest(camera=each.camera, t=each.t, width=width, height=height)
+                camera = resolve_camera(request, scene)
+            width, height = camera.width, camera.height  # those of the first frame
+            frames.append((camera, each.t))
+        path = CameraPath(tuple(frames), DEFAULT_FPS)
+    field, limits = "frames" if body.path is None else "path.camera_path", service.settings
+    if len(path.frames) > limits.max_video_frames:
+        raise InvalidInput(field, f"at most {limits.max_video_frames}", len(path.frames))
+    check_pixels(path.frames[0][0], len(path.frames), limits.max_pixels, limits.max_video_pixels, field)
     return scene, path
+
+
+@contextmanager
+def _named_in(place: str) -> Iterator[None]:
+    """Name the field of an error by its place in the request, unless it is the size, which all frames share."""
+    try:
+        yield
+    except InvalidInput as error:
+        raise (error if error.field in ("width", "height") else error.renamed(f"{place}.{error.field}")) from None
