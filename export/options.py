@@ -78,7 +78,12 @@ class ExportOptions:
     @property
     def scene_file(self) -> Path:
         """The path of the scene file."""
-        return self.model.with_suffix(".onnx") if self.output is None else self.output
+        if self.output is not None:
+            return self.output
+        if not self.model.is_dir():
+            return self.model.with_suffix(".onnx")
+        folder = self.model.resolve()  # "." has no name, and a folder's has no suffix
+        return folder.parent / f"{folder.name}.onnx"
 
     @property
     def chosen_plan(self) -> str | None:

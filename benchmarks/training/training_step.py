@@ -101,6 +101,7 @@ def make_trainer(options: Options, made: Path, images: int, device: str = "cpu")
         static_fraction=0.0,
         static_window_fraction=0.0,
         sh_degree_fraction=0.0,
+        half_resolution_fraction=0.0,
         refine_stop_fraction=0.0,
     )
     trainer = Trainer(config, load_scene(data, options.size))

@@ -25,6 +25,7 @@ from export.options import ConvertOptions, require_folder_of
 from export.plans.registry import PLANS
 from export.progress import tracked
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -80,8 +81,10 @@ def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: fl
     with replacing(file) as temporary:
         if file.suffix == ".spz":
             write_spz(temporary, gaussians, metadata.antialiasing)
+        elif file.suffix == ".ply":
+            write_ply(temporary, gaussians)
         else:
-            (write_ply if file.suffix == ".ply" else write_gltf)(temporary, gaussians)
+            write_gltf(temporary, gaussians, framing(metadata).up)
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
         psnr = RoundTrip(session).psnr(written, t)
         require(psnr, options.min_psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
@@ -122,7 +125,8 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
         return of_the_moment(session.gaussians(t), metadata.plan)
 
     with tracked(console) as progress, replacing(out) as temporary:
-        write_usd(temporary, pose, times, session.scene.changing, progress("writing frames", len(times)))
+        on_frame = progress("writing frames", len(times))
+        write_usd(temporary, pose, times, session.scene.changing, on_frame, framing(metadata).up)
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
         worst = min(check.psnr(shown(number), times[number]) for number in compared)
@@ -140,11 +144,11 @@ def _visionary(session: DeformationSession, options: ConvertOptions, console: Co
     """Write a model for Visionary, and the scene.json of its editor."""
     out, metadata = options.out, session.scene.metadata
     model, check = visionary_model(options.scene), RoundTrip(session, mip=False)
-    times = np.linspace(*metadata.time_range, COMPARED if session.scene.moving_count else 1).astype(np.float32)
+    times = np.linspace(*metadata.time_range, COMPARED if session.scene.moving_count else 1).tolist()
     with replacing(out) as temporary:
         temporary.write_bytes(model.SerializeToString())
         shown = visionary_of(temporary)
-        worst = min(check.psnr(shown(t), t) for t in times.tolist())
+        worst = min(check.psnr(shown(t), t) for t in times)
         require(worst, options.min_psnr, LOSSY, out.name)
     scene_json = out.with_name(f"{out.name.removesuffix(VISIONARY)}.scene.json")
     write_text(scene_json, json.dumps(visionary_scene(out.name, metadata), indent=2) + "\n")

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from export.importers.splats.axes import from_right_up_back
+from export.importers.scene import UP
+from export.importers.splats.axes import from_right_up_back, upright
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -26,8 +27,9 @@ PRIMITIVE = {
 }
 
 
-def write_gltf(file: Path, gaussians: Gaussians) -> None:
-    """Write all Gaussians, activated, float32; axes right, up, back. Viewers without the extension show points.
+def write_gltf(file: Path, gaussians: Gaussians, up: np.ndarray = UP) -> None:
+    """Write all Gaussians, activated, float32; axes right, up, back, and a node whose rotation turns the scene's `up`,
+    [3], to y. Viewers without the extension show points.
 
     Raises `InvalidInput` for none, which glTF can't hold, and for more than 4 GiB.
     """
@@ -55,7 +57,7 @@ def write_gltf(file: Path, gaussians: Gaussians) -> None:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0, "rotation": upright(up)}],
         "meshes": [{"primitives": [_primitive(list(attributes))]}],
         "buffers": [{"byteLength": at}],
         "bufferViews": views,
@@ -74,7 +76,7 @@ def write_gltf(file: Path, gaussians: Gaussians) -> None:
 
 
 def read_gltf(file: Path) -> Gaussians:
-    """Read a file of `write_gltf`."""
+    """Read a file of `write_gltf`, in the axes of the scene: without the rotation of its node."""
     contents = file.read_bytes()
     size, _ = CHUNK.unpack_from(contents, HEADER.size)
     start = HEADER.size + CHUNK.size

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from export.importers.splats.axes import from_right_up_back
+from export.importers.scene import UP
+from export.importers.splats.axes import from_right_up_back, upright
 from export.importers.splats.base import as_float32
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -28,19 +29,23 @@ def write_usd(
     times: Sequence[float],
     changing: Sequence[str] = (),
     on_frame: Callable[[], object] = lambda: None,
+    up: np.ndarray = UP,
 ) -> None:
-    """Write the Gaussians at some times as frames 0, 1, …, or one time without samples. float32, activated; y is up.
+    """Write the Gaussians at some times as frames 0, 1, …, or one time without samples. float32, activated; the prim is
+    rotated so that the scene's `up`, [3], is y.
 
     Opacities and SH are those of the first time unless they are `changing`. Raises `InvalidInput` if OpenUSD or its
     schema is missing.
     """
-    usd, vol, geom, vt = _modules(file)
+    usd, vol, geom, vt, gf = _modules(file)
     stage = usd.Stage.CreateInMemory()
     geom.SetStageUpAxis(stage, geom.Tokens.y)
     geom.SetStageMetersPerUnit(stage, geom.LinearUnits.meters)
     field = vol.ParticleField3DGaussianSplat.Define(stage, PRIM)
     prim = field.GetPrim()
     stage.SetDefaultPrim(prim)
+    x, y, z, w = upright(up)
+    geom.Xformable(prim).AddOrientOp(geom.XformOp.PrecisionDouble).Set(gf.Quatd(w, x, y, z))
     for number, t in enumerate(times):
         g = gaussians(t)
         means, quats, sh = from_right_up_back(g.means, g.quats, g.sh)
@@ -77,7 +82,7 @@ def _extent(means: np.ndarray, scales: np.ndarray) -> np.ndarray:
 
 
 def read_usd(file: Path) -> Callable[[int], Gaussians]:
-    """Read a file of `write_usd`; returns a function from frame numbers to Gaussians."""
+    """Read a file of `write_usd`; returns a function from frame numbers to Gaussians, in the axes of the scene."""
     usd, *_ = _modules(file)
     stage = usd.Stage.Open(str(file))  # prims are valid as long as it exists
 
@@ -98,9 +103,9 @@ def read_usd(file: Path) -> Callable[[int], Gaussians]:
 def _modules(file: Path) -> tuple[Any, ...]:
     """Modules of OpenUSD, which has no type stubs."""
     try:
-        from pxr import Usd, UsdGeom, UsdVol, Vt
+        from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
     except ModuleNotFoundError:
         raise InvalidInput("out", "another format, or pip install '.[usd]'", f"{file.name} without OpenUSD") from None
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise InvalidInput("out", "another format, or OpenUSD 26.3 or later", f"{file.name} with an older version")
-    return Usd, UsdVol, UsdGeom, Vt
+    return Usd, UsdVol, UsdGeom, Vt, Gf

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ from rich.table import Column, Table
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
 from export.jobs.store import METADATA_BYTES, PLAN_PART, check_min_psnr, squared, stored, within_bytes
-from export.jobs.sweep import Sweep, pruning_levels
+from export.jobs.sweep import Sweep, as_stored, pruning_levels
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions, require_folder_of
@@ -70,7 +69,7 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
         )
         contents = None
         if result:
-            result.points[result.chosen] = replace(result.points[result.chosen], candidate=chosen, error=error)
+            result.points[result.chosen] = as_stored(job, result.points[result.chosen], chosen, error)
             contents = report(job, result)
             contents["points"][result.chosen]["bytes"] = exported.size
     if contents:
@@ -130,7 +129,7 @@ def _planned_within_bytes(job: ExportJob, plan: str) -> tuple[Candidate, Rendere
         return whole, job.error(whole)
     candidates = [whole, *(job.candidate(plan, level) for level in (pruning_levels(job) if job.rules else ()))]
     different = {candidate.digest: candidate for candidate in candidates}.values()
-    fitting = within_bytes(job, list(different))
+    fitting = within_bytes(job, list(different), [])
     best, error = max(fitting, key=lambda each: each[1].psnr_worst)
     if required is None:
         return best, error

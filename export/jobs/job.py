@@ -22,7 +22,7 @@ from export.plans.base import BASELINE
 from export.plans.registry import build, check_appearance, plan_of
 from export.progress import Track, no_progress
 from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
-from export.pruning.mask import NetworkMask, bake_pruned, in_spatial_order, rows, unpruned, with_sh_degree
+from export.pruning.mask import NetworkMask, bake_pruned, in_spatial_order, rows, unpruned, with_layers, with_sh_degree
 from export.trajectories.poses import SinglePoses
 from export.trajectories.sampling import Sampler, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
@@ -190,6 +190,8 @@ class ExportJob:
         check_appearance(plan, changing_outputs(self.model))
         self.stability.require(plan)
         model = self.pruned(pruning_db)
+        if plan_of(plan).counts_layers:
+            model = with_layers(model, self.model)
         if sh_degree is not None:
             model = with_sh_degree(model, sh_degree)
         return self._written(plan, pruning_db, model)

@@ -2,7 +2,8 @@
 many bytes allow."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from export.measure.views import cameras_of_file, evaluation_views
 from export.storage.choice import COARSEST, Stored, fewest_bytes, packed, smallest_error
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained
-from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_train.evaluation.metrics import MAX_PSNR
 
 PLAN_PART = 0.75
@@ -26,6 +27,9 @@ LOWEST_MIN_PSNR = 10.0
 
 METADATA_BYTES = 3000
 """Bytes that are kept free for what is measured last and added to the metadata of the written file."""
+
+UNUSABLE = (InvalidInput, SceneFileInvalid)
+"""Errors of a file whose poses can't be drawn: rounded to fewer bits, or overflowing in float32."""
 
 Measure = Callable[[onnx.ModelProto, int], RenderedError]
 """The error of a scene file's frames: of all, or of every n-th."""
@@ -66,19 +70,49 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
     return None if found is None else (_with_entry(contents, *found), found[1])
 
 
-def within_bytes(job: ExportJob, candidates: Sequence[Candidate]) -> list[tuple[Candidate, RenderedError]]:
+def within_bytes(
+    job: ExportJob, candidates: Sequence[Candidate], refused: list[tuple[str, str]]
+) -> list[tuple[Candidate, RenderedError]]:
     """Those of the candidates that fit into the job's bytes, with arrays as fine as these allow, and their errors.
 
-    Raises `TargetNotReached` if none fits.
+    Raises `TargetNotReached` if none fits, and as `usable` does, which also adds to `refused`.
     """
     assert job.max_bytes is not None
-    sizes = {candidate: min_bytes(job, candidate) for candidate in candidates}
-    if fitting := [candidate for candidate, size in sizes.items() if size <= job.max_bytes]:
-        return [_finest(job, candidate, job.max_bytes) for candidate in fitting]
-    candidate, size = min(sizes.items(), key=lambda each: each[1])
-    worst = _finest(job, candidate, job.max_bytes)[1].psnr_worst
-    smallest = f"at least {math.ceil(size / 1e3) / 1e3:.3f}, the smallest file tried: {worst:.1f} dB on its worst frame"
-    raise TargetNotReached("max_mb", smallest, job.max_bytes / 1e6)
+    limit, sizes = job.max_bytes, {candidate: min_bytes(job, candidate) for candidate in candidates}
+    if fitting := [candidate for candidate, size in sizes.items() if size <= limit]:
+        return list(usable(fitting, lambda candidate: _finest(job, candidate, limit), refused))
+    by_size = sorted(sizes, key=sizes.__getitem__)
+    candidate, error = next(usable(by_size, lambda candidate: (candidate, _finest(job, candidate, limit)[1]), refused))
+    size, worst = math.ceil(sizes[candidate] / 1e3) / 1e3, error.psnr_worst
+    smallest = f"at least {size:.3f}, the smallest file tried: {worst:.1f} dB on its worst frame"
+    raise TargetNotReached("max_mb", smallest, limit / 1e6)
+
+
+def usable(
+    candidates: Iterable[Candidate],
+    measure: Callable[[Candidate], tuple[Candidate, RenderedError]],
+    refused: list[tuple[str, str]],
+) -> Iterator[tuple[Candidate, RenderedError]]:
+    """What `measure` returns for each candidate; those that can't be drawn are added to `refused`, by plan and why.
+
+    Raises `InvalidInput` if no other is left.
+    """
+    none = True
+    for candidate in candidates:
+        try:
+            measured = measure(candidate)
+        except UNUSABLE as error:  # its motion overflows in float32 at a time that no estimate has tried
+            refused.append((candidate.plan, str(error)))
+        else:
+            none = False
+            yield measured
+    if none:
+        raise nothing_left(refused)
+
+
+def nothing_left(refused: Sequence[tuple[str, str]]) -> InvalidInput:
+    """The error of a model of which all plans were refused."""
+    return InvalidInput("model", "one that some plan can hold", "; ".join(why for _, why in refused))
 
 
 def min_bytes(job: ExportJob, candidate: Candidate) -> int:
@@ -106,17 +140,25 @@ def _in_fewer_bits(
     allowed = list[RenderedError]()
 
     def is_allowed(model: onnx.ModelProto) -> bool:
-        error = measured(model, 1)
-        allowed.extend([error] if error.psnr_worst >= min_psnr else [])
-        return error.psnr_worst >= min_psnr
+        with suppress(*UNUSABLE):
+            error = measured(model, 1)
+            allowed.extend([error] if error.psnr_worst >= min_psnr else [])
+            return error.psnr_worst >= min_psnr
+        return False
 
     found = fewest_bytes(contents, _estimate(measured), is_allowed)
     return None if found is None else (found, allowed[-1])
 
 
 def _estimate(measured: Measure) -> Callable[[onnx.ModelProto], float]:
-    """A function that returns the squared error of the worst of every n-th frame."""
-    return lambda model: squared(measured(model, ESTIMATE_STRIDE).psnr_worst)
+    """A function that returns the squared error of the worst of every n-th frame, infinite if they can't be drawn."""
+
+    def estimate(model: onnx.ModelProto) -> float:
+        with suppress(*UNUSABLE):
+            return squared(measured(model, ESTIMATE_STRIDE).psnr_worst)
+        return math.inf
+
+    return estimate
 
 
 def _with_entry(contents: onnx.ModelProto, found: Stored, error: RenderedError) -> onnx.ModelProto:

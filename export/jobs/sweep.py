@@ -4,19 +4,19 @@ rest is measured in full."""
 import heapq
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from operator import le
 from typing import Any, NamedTuple
 
 from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
-from export.jobs.store import PLAN_PART, min_bytes, within_bytes
+from export.jobs.store import PLAN_PART, min_bytes, nothing_left, usable, within_bytes
 from export.measure.frame_memory import frame_memory
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
-from msdgs_serve.scene.errors import InvalidInput, MsdgsError, SceneFileInvalid
+from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
 
 MAX_RELATIVE_COST = 4.0
@@ -273,7 +273,7 @@ class Sweep:
 
     def _measured(self) -> SweepResult:
         if not self.estimates:
-            raise self._nothing_left()
+            raise nothing_left(self.refused)
         ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)
         if self.max_bytes is not None:
             ahead = [e for e in ahead if e.size <= self.max_bytes] or [min(self.estimates, key=lambda e: e.size)]
@@ -282,13 +282,14 @@ class Sweep:
         ahead = ahead[:MAX_POINTS]
         ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
         candidates = [estimate.candidate for estimate in ahead]
-        measured = self._errors(candidates) if self.max_bytes is None else within_bytes(self.job, candidates)
+        if self.max_bytes is None:
+            tracked = self._tracked(candidates)
+            measured = list(usable(tracked, lambda candidate: (candidate, self._error(candidate)), self.refused))
+        else:
+            measured = within_bytes(self.job, candidates, self.refused)
         points = self._points(measured)
         left = [estimate for estimate in self.estimates if estimate not in ahead]
         return SweepResult(points, left, self._best(points), self.refused, front(points))
-
-    def _nothing_left(self) -> InvalidInput:
-        return InvalidInput("model", "one that some plan can hold", "; ".join(why for _, why in self.refused))
 
     def _best(self, points: list[Point]) -> int:
         best = choose(points, self.min_psnr)
@@ -305,25 +306,17 @@ class Sweep:
     def _points(self, measured: list[tuple[Candidate, RenderedError]]) -> list[Point]:
         """Points of candidates and their errors."""
         candidates = [candidate for candidate, _ in measured]
-        images = [self._images_psnr(candidate) for candidate in candidates]
+        images = [_images_psnr(self.job, candidate) for candidate in candidates]
         times = time_frames(candidates, self._timed, self.job.info.background, self.job.progress)
-        view = SceneCamera("timed", self._timed[0].t, self._timed[0].camera)
-        memory = frame_memory([candidate.path for candidate in candidates], view, self.job.progress)
+        memory = _memory(self.job, candidates)
         parts = zip(measured, times, memory, images, strict=True)
         return [Point(c, time, error, bytes_, psnr) for (c, error), time, bytes_, psnr in parts]
 
-    def _errors(self, candidates: list[Candidate]) -> list[tuple[Candidate, RenderedError]]:
+    def _tracked(self, candidates: list[Candidate]) -> Iterator[Candidate]:
         on_error = self.job.progress("all frames of the points", len(candidates))
-        errors = []
         for candidate in candidates:
-            try:
-                errors.append((candidate, self._error(candidate)))
-            except SceneFileInvalid as error:  # its motion overflows in float32 at a time that no estimate has tried
-                self.refused.append((candidate.plan, str(error)))
+            yield candidate
             on_error()
-        if not errors:
-            raise self._nothing_left()
-        return errors
 
     def _error(self, candidate: Candidate) -> RenderedError:
         """The error of all frames, measured once."""
@@ -331,6 +324,20 @@ class Sweep:
             self._measured_errors[candidate] = self.job.error(candidate)
         return self._measured_errors[candidate]
 
-    def _images_psnr(self, candidate: Candidate) -> float | None:
-        options = self.job.model.rasterizer
-        return self.job.images.psnr(candidate.session.gaussians, options) if self.job.images else None
+
+def as_stored(job: ExportJob, point: Point, candidate: Candidate, error: RenderedError) -> Point:
+    """A point with the file in which its candidate is stored: measured in full, but for times, which are the same."""
+    if candidate is point.candidate:
+        return point
+    (memory,), images_psnr = _memory(job, [candidate]), _images_psnr(job, candidate)
+    return replace(point, candidate=candidate, error=error, memory=memory, images_psnr=images_psnr)
+
+
+def _memory(job: ExportJob, candidates: Sequence[Candidate]) -> list[int | None]:
+    view = job.exact.views[0]
+    camera = SceneCamera("timed", view.t, view.camera)
+    return frame_memory([candidate.path for candidate in candidates], camera, job.progress)
+
+
+def _images_psnr(job: ExportJob, candidate: Candidate) -> float | None:
+    return job.images.psnr(candidate.session.gaussians, job.model.rasterizer) if job.images else None

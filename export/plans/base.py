@@ -43,6 +43,8 @@ class Plan:
     """The names that a sweep tries, given the number of the model's layers."""
     counts: range | None = None
     """Allowed counts; None: it has no size."""
+    counts_layers: bool = False
+    """Whether its size is a number of layers as trained, none of which pruning may then remove."""
     fitted: bool = False
     """Whether it is fitted to float64 trajectories; others run layers for each frame."""
     speedup: float = 1.0

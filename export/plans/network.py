@@ -138,4 +138,5 @@ PREFIX = Plan(
     lambda baked, spec, sample: prefix(baked, spec.count or 0),
     candidates=lambda layers: [f"prefix:{k}" for k in range(1, layers)],
     counts=range(1, 1_001),
+    counts_layers=True,
 )

@@ -124,6 +124,15 @@ def with_sh_degree(pruned: PrunedModel, sh_degree: int) -> PrunedModel:
     return PrunedModel(moving, static, pruned.ids, pruned.network, (*pruned.left_out, entry))
 
 
+def with_layers(pruned: PrunedModel, model: DynamicGaussians) -> PrunedModel:
+    """The same Gaussians with all layers that `model` had before it was pruned."""
+    network = replace(pruned.network, layers=full_mask(model).network.layers)
+    ids = torch.from_numpy(pruned.ids[: len(pruned.moving.gaussians)])
+    moving = _model(model, network, ids, pruned.moving.config.sh_degree)
+    left_out = tuple(entry for entry in pruned.left_out if entry["rule"] != "layers")
+    return replace(pruned, moving=moving, network=network, left_out=left_out)
+
+
 def rows(gaussians: Gaussians, ids: np.ndarray, sh_degree: int) -> Gaussians:
     """Some Gaussians, with the SH bands up to `sh_degree`."""
     g, coefficients = gaussians, sh_coefficients(sh_degree)

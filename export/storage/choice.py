@@ -38,7 +38,7 @@ GROUPS = {
     "quats": Group(r"canonical_quats", _bits(directions, 8, 16)),
     "static scales": Group(r"static_scales", _bits(logarithms, 8, 16)),
     "scales": Group(r"canonical_log_scales", _bits(in_range, 8, 16)),
-    "mean scales": Group(r"mean\.scales", _bits(logarithms, 8, 16)),
+    "mean scales": Group(r"(mean|frames)\.scales", _bits(logarithms, 8, 16)),
     "mean quats": Group(r"mean\.quats", _bits(in_range, 8, 16)),
     "opacities": Group(r"(static_)?opacities", _bits(lambda bits: fractions(bits, 1.0), 8, 16)),
     "sh": Group(r"((static|canonical)_)?sh", _bits(in_range, 8, 16)),

@@ -98,6 +98,27 @@ def test_every_kind_of_model_exports(tmp_path: Path, count: int, changes: dict[s
         np.testing.assert_allclose(got, want, rtol=0, atol=bound)
 
 
+@pytest.mark.parametrize(
+    ("model", "scene"),
+    [
+        ("ball/model.pt", "ball/model.onnx"),
+        ("v0.5.ply", "v0.5.onnx"),
+        ("ball_0.5", "ball_0.5.onnx"),
+        ("ball_0.6/", "ball_0.6.onnx"),
+        ("ball_0.5/..", "runs.onnx"),
+        (".", "runs.onnx"),
+    ],
+)
+def test_a_scene_file_is_written_beside_a_file_or_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str, scene: str
+):
+    for name in ("ball_0.5", "ball_0.6"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "runs")
+    place = tmp_path if scene == "runs.onnx" else tmp_path / "runs"
+    assert ExportOptions(Path(model)).scene_file.absolute() == place / scene
+
+
 @pytest.mark.parametrize("of", ["model", "splats"])
 def test_the_seconds_of_a_scene_are_stored_if_they_are_given(tmp_path: Path, of: str):
     file = tmp_path / "frame_1.ply"

@@ -32,6 +32,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
+from msdgs_train.gaussians.model_file import SceneInfo
 from tests.support.models import MLP, NODES, SCENE, random_model
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
@@ -39,11 +40,11 @@ from tests.support.tolerances import tolerance
 QUIET = Console(quiet=True)
 
 
-def scene_file(folder: Path, plan: str = "network", **config: Any) -> Path:
+def scene_file(folder: Path, plan: str = "network", info: SceneInfo = SCENE, **config: Any) -> Path:
     settings: dict[str, Any] = {"layers": (replace(MLP, time_frequencies=2),) * 2} | config
     model = random_model(300, noise=0.02, **settings)
     file = folder / "scene.onnx"
-    file.write_bytes(build(plan, bake(model, SCENE, "0" * 64)).SerializeToString())
+    file.write_bytes(build(plan, bake(model, info, "0" * 64)).SerializeToString())
     return file
 
 
@@ -196,6 +197,25 @@ def test_usd_has_a_sample_a_frame(tmp_path: Path, ending: str):
     assert_same(read_usd(tmp_path / f"still.{ending}")(0), session.gaussians(0.4))
 
 
+@pytest.mark.parametrize(("info", "up"), [(SCENE, [0, -1, 0]), (SceneInfo(bounds=SCENE.bounds), [0, 0, 1])])
+def test_up_is_y_by_what_a_file_says(tmp_path: Path, info: SceneInfo, up: list[int]):
+    scene = scene_file(tmp_path, info=info)
+    expected = DeformationSession(scene).gaussians(0.4)
+    run(scene, tmp_path / "a.glb", t=0.4)
+    contents = (tmp_path / "a.glb").read_bytes()
+    text, first = struct.unpack_from("<I", contents, 12)[0], expected.means[0] * (1, -1, -1)  # as glTF holds it
+    (node,) = json.loads(contents[20 : 20 + text])["nodes"]
+    height = tolerance("splat_values")
+    assert Rotation.from_quat(node["rotation"]).apply(first)[1] == pytest.approx(expected.means[0] @ up, abs=height)
+    assert_same(read_gltf(tmp_path / "a.glb"), expected)
+    geom, gf = pytest.importorskip("pxr.UsdGeom"), pytest.importorskip("pxr.Gf")
+    run(scene, tmp_path / "a.usda", t=0.4)
+    stage = pytest.importorskip("pxr.Usd").Stage.Open(str(tmp_path / "a.usda"))
+    to_world = geom.XformCache().GetLocalToWorldTransform(stage.GetDefaultPrim())
+    assert to_world.Transform(gf.Vec3d(*first.tolist()))[1] == pytest.approx(expected.means[0] @ up, abs=height)
+    assert_same(read_usd(tmp_path / "a.usda")(0), expected)
+
+
 def test_a_failed_conversion_keeps_the_old_file(tmp_path: Path):
     scene, out = scene_file(tmp_path), tmp_path / "a.spz"
     out.write_text("old")
@@ -256,6 +276,13 @@ def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str, confi
         assert np.abs(got.means - expected.means).max() <= tolerance("export.relative")
         ours, theirs = covariances(expected), covariances(got)
         assert np.abs(ours - theirs).max() <= tolerance("visionary.relative") * np.abs(ours).max()
+
+
+def test_visionary_compares_times_of_a_range_whose_ends_round_outwards(tmp_path: Path):
+    low, high = np.array(ends := (0.7, 1.6), np.float32).tolist()
+    assert low < ends[0] < ends[1] < high
+    run(scene_file(tmp_path, info=SceneInfo(time_range=ends, bounds=SCENE.bounds)), tmp_path / "a.visionary.onnx")
+    assert (tmp_path / "a.visionary.onnx").is_file()
 
 
 def covariances(g: Gaussians) -> np.ndarray:

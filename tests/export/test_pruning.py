@@ -1,6 +1,7 @@
 """Pruning: only what moves stays in the graph, each rule can be switched off, and the error allowed is kept."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,14 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.baked import BakedScene
-from msdgs_serve.scene.errors import SceneFileInvalid
+from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.layers.mlp import MLPLayer
 from tests.support.images import psnr
-from tests.support.models import CAMERA, GROUND, NODES, OBJECT, SCENE, moving_object, random_model, saved
+from tests.support.models import CAMERA, GROUND, MLP, NODES, OBJECT, SCENE, moving_object, random_model, rise, saved
 from tests.support.tolerances import assert_close, tolerance
 
 pytestmark = pytest.mark.slow
@@ -130,6 +131,26 @@ def test_a_rule_that_is_switched_off_removes_nothing(tmp_path: Path, rule: str |
     scene = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0).session.scene
     assert not {entry["rule"] for entry in scene.metadata.left_out} & set(off)
     assert all(KEPT[name](scene) for name in off if name in KEPT)
+
+
+def test_a_prefix_has_the_first_layers_as_trained(tmp_path: Path):
+    """Although the model does without one of them."""
+    model = moving_object(moves=False, layers=(replace(MLP, depth=1),) * 3)
+    with torch.no_grad():
+        rise(model.deformation.layers[1])
+        rise(model.deformation.layers[2])
+    job = job_of(tmp_path, model)
+    assert job.pruned(50.0).network.layers == (1, 2)
+    candidate = job.candidate("prefix:2", 50.0)
+    scene, ids = candidate.session.scene, candidate.pruned.ids
+    assert (len(scene.metadata.layers), scene.metadata.plan) == (2, "prefix:2")
+    assert "layers" not in {entry["rule"] for entry in scene.metadata.left_out}
+    assert 0 < scene.moving_count <= OBJECT
+    want = job.model.pose(1.0, 2).means.numpy()[ids[: scene.moving_count]]
+    assert_close(candidate.session.pose(1.0)[0], want, "export.relative")
+    job.candidate("prefix:3", 50.0)
+    with pytest.raises(InvalidInput, match="prefix:k with k from 1 to 3"):
+        job.candidate("prefix:4", 50.0)
 
 
 def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

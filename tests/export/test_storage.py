@@ -13,6 +13,7 @@ from onnx import TensorProto
 
 from export.convert import main as convert_main
 from export.exporters.round_trip import RoundTrip
+from export.importers.sequence import Frames, sequence_scene
 from export.jobs.bake import bake
 from export.jobs.job import ExportJob
 from export.jobs.write import properties, set_properties
@@ -194,6 +195,27 @@ def test_a_scene_file_is_stored_anew(tmp_path: Path, kind: str):
     scene.write_bytes(build("network", bake(random_model(1, layers=()), SCENE, "0" * 64)).SerializeToString())
     assert convert_main(ConvertOptions(scene, out)) == 1  # all arrays are small
     assert out.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["frames.scales", "sizes"])
+def test_scales_of_a_wide_range_stay_above_zero(tmp_path: Path, name: str):
+    """By their logarithms; or as they are, where equal steps would round the smallest to 0."""
+    frames = tuple(some_gaussians(count, 0) for count in (200, 201))
+    for frame in frames:
+        frame.scales[:, 2] = 1e-8
+        frame.scales[0] = 2
+    contents = sequence_scene(Frames(frames, 0, "dilate", blended=False), "0" * 64)
+    for each in (*contents.graph.initializer, *contents.graph.node):
+        each.name = each.name.replace("frames.scales", name)
+    for node in contents.graph.node:
+        node.input[:] = [given.replace("frames.scales", name) for given in node.input]
+    (tmp_path / "frames.onnx").write_bytes(contents.SerializeToString())
+    assert convert_main(ConvertOptions(tmp_path / "frames.onnx", tmp_path / "small.onnx")) == 0
+    session = DeformationSession(tmp_path / "small.onnx")
+    (entry,) = session.scene.metadata.left_out
+    assert {"mean scales", "other"} & entry["stored"].keys() == ({"mean scales", "other"} if name != "sizes" else set())
+    for t in (0.0, 1.0):
+        assert session.gaussians(t).scales.min() > 0
 
 
 def test_imported_splats_are_stored_alike(tmp_path: Path):

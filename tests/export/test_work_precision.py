@@ -12,9 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from export.jobs.job import ESTIMATE_STRIDE, ExportJob
+from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
+from export.jobs.store import within_bytes
 from export.jobs.sweep import TIME_MARGIN, Point, Sweep, SweepResult, choose, front
+from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
 from export.options import ExportOptions
@@ -22,7 +24,8 @@ from export.plans.registry import PLANS
 from export.pruning import RULES
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.errors import SceneFileInvalid
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
+from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 from tests.support.tolerances import tolerance
 
@@ -123,6 +126,29 @@ def test_plans_whose_motion_overflows_in_float32_are_refused_and_fitted_ones_are
     result = Sweep(job).run()
     assert {plan for plan, why in result.refused if "overflow" in why} == {"network", "prefix:1"}
     assert {point.candidate.plan for point in result.points} == {"compact:70"}
+
+
+def test_a_file_of_few_bytes_that_overflows_is_refused_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    measure, overflowing, refused = ExportJob.error, set[float | None](), list[tuple[str, str]]()
+
+    def error(job: ExportJob, candidate: Candidate, every: int = 1) -> RenderedError:
+        if every == 1 and candidate.pruning_db in overflowing:
+            raise SceneFileInvalid("scene", "means", "overflow")
+        return measure(job, candidate, every)
+
+    job = ExportJob(saved(tmp_path, moving_object()), tmp_path, max_bytes=10**6)
+    candidates = [job.candidate("network", level) for level in (None, 50.0)]
+    monkeypatch.setattr(ExportJob, "error", error)
+    overflowing.add(50.0)
+    assert [kept.pruning_db for kept, _ in within_bytes(job, candidates, refused)] == [None]
+    job.max_bytes = 1000
+    with pytest.raises(TargetNotReached, match="the smallest file tried"):
+        within_bytes(job, candidates, refused)
+    assert refused == [("network", "scene: `means` overflow")] * 2
+    overflowing.add(None)
+    for job.max_bytes in (1000, 10**6):
+        with pytest.raises(InvalidInput, match=r"one that some plan can hold, got .*overflow"):
+            within_bytes(job, candidates, refused)
 
 
 def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
@@ -294,6 +320,27 @@ def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.Capt
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "model.onnx", "model.pt", "model.report.json", "model.report.md", "model.report.png",
     ]  # fmt: skip
+
+
+def test_the_chosen_point_of_a_report_is_the_file_that_was_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def psnr(pose: Pose, options: RasterizerOptions) -> float:
+        return 20 + float(pose(0.5).scales.mean(dtype=np.float64))
+
+    images = SimpleNamespace(training=(), psnr=psnr)
+    monkeypatch.setattr("export.jobs.command._held_out_images", lambda *_: images)
+    monkeypatch.setattr("export.jobs.sweep.frame_memory", lambda paths, *_: [path.stat().st_size for path in paths])
+    assert main(ExportOptions(saved(tmp_path, moving_object()), min_psnr=45.0)) == 0
+    (chosen,) = (p for p in json.loads((tmp_path / "model.report.json").read_text())["points"] if p["chosen"])
+    assert chosen["packed"]
+    assert chosen["images_psnr"] == psnr(DeformationSession(tmp_path / "model.onnx").gaussians, GSPLAT)
+    assert chosen["memory_bytes"] <= chosen["bytes"]
+
+
+def test_a_plan_of_all_layers_is_written_although_one_has_no_effect(tmp_path: Path):
+    assert main(ExportOptions(saved(tmp_path, moving_object()), plan="prefix:2", min_psnr=45.0)) == 0
+    scene = DeformationSession(tmp_path / "model.onnx").scene
+    assert (scene.metadata.plan, len(scene.metadata.layers)) == ("prefix:2", 2)
+    assert 0 < scene.moving_count <= OBJECT
 
 
 @pytest.mark.parametrize("place", ["export.jobs.command.Sweep.run", "export.jobs.command.write_scene"])
