@@ -109,9 +109,10 @@ class Schedule(NamedTuple):
         every = self.refine_every
         return every > 0 and self.refine_start <= step <= self.refine_stop and step % every == 0
 
-    def prunes_hidden(self, step: int) -> bool:
-        """Whether density control goes on and all times take part alike in this step: `gradient` regularizes then."""
-        return step < self.refine_stop and not self.is_windowed(step)
+    def prunes_hidden(self, step: int, *, several_per_time: bool) -> bool:
+        """Whether `gradient` regularizes in this step: until density control ends, but in a time window only if it has
+        several images of each time. With one, fast objects would fade."""
+        return step < self.refine_stop and (several_per_time or not self.is_windowed(step))
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are reset after this step, counted from 1."""

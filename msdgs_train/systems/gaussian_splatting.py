@@ -46,6 +46,7 @@ class GaussianSplatting:
         if is_rig and views > 1:
             config = config.updated(layers=[layer.for_rig(len(cameras) // views) for layer in config.model.layers])
             schedule = schedule._replace(config=config)
+        self.several_per_time = 2 * len({frame.t for frame in scene.splits["train"]}) <= len(cameras)
         self.schedule, self.config, self.scene = schedule, config, scene
         bounds = SceneBounds(self.scene_half_size, scene.time_range)
         self.model = _new_model(schedule, scene, bounds, distinct).to(config.run.device)
@@ -166,7 +167,7 @@ class GaussianSplatting:
 
     def _regularizers(self, posed: PosedGaussians, motions: Any, t: float, step: int) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
-        pruning = self.schedule.prunes_hidden(step)
+        pruning = self.schedule.prunes_hidden(step, several_per_time=self.several_per_time)
         terms = list(self.config.density.regularizers(posed.opacities, posed.scales, pruning=pruning).values())
         if motions is not None:
             time = posed.means.new_tensor(t)

@@ -102,8 +102,10 @@ def test_without_density_control_nothing_waits_for_its_end() -> None:
         Schedule.from_config(small_config(**settings, refine_every_fraction=every, refine_stop_fraction=0.7))
         for every in (0.01, 0.0)
     )
-    assert [on.prunes_hidden(0), on.resets_at(100), on.averages_at(699), on.averages_at(701)] == [1, 1, 0, 1]
-    assert [off.prunes_hidden(0), off.resets_at(100), off.averages_at(699)] == [0, 0, 1]
+    prunes = [schedule.prunes_hidden(0, several_per_time=True) for schedule in (on, off)]
+    assert prunes == [True, False]
+    assert [on.resets_at(100), on.averages_at(699), on.averages_at(701)] == [True, False, True]
+    assert [off.resets_at(100), off.averages_at(699)] == [False, True]
 
 
 def test_phases_follow_each_other_and_cover_the_run() -> None:

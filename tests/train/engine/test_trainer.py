@@ -288,11 +288,14 @@ def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("strategy", "step", "pruning"),
-    [("gradient", 18, True), ("gradient", 19, False), ("gradient", 17, False), ("mcmc", 19, True)],
-)
+    ("strategy", "step", "several_per_time", "pruning"),
+    [
+        ("gradient", 18, False, True), ("gradient", 19, True, False), ("gradient", 17, False, False),
+        ("gradient", 17, True, True), ("mcmc", 19, False, True),
+    ],
+)  # fmt: skip
 def test_weighted_regularizers_are_added_to_the_loss(
-    data: Path, monkeypatch: pytest.MonkeyPatch, strategy: str, step: int, pruning: bool
+    data: Path, monkeypatch: pytest.MonkeyPatch, strategy: str, step: int, several_per_time: bool, pruning: bool
 ) -> None:
     """The time window is full from step 18 on, and density control ends with step 19."""
     plane = PlaneConfig(
@@ -301,7 +304,10 @@ def test_weighted_regularizers_are_added_to_the_loss(
     )  # fmt: skip
     density: dict[str, Any] = {"density_strategy": strategy, "opacity_reg": 2e4, "scale_reg": 3e5}
     model = dataclasses.replace(small_config().model, layers=(plane, MLP))
-    system = splatting(Trainer(small_config(model=model, static_fraction=0.0, **density), load_scene(data)))
+    scene = load_scene(data)
+    if several_per_time:
+        scene.splits["train"] *= 2
+    system = splatting(Trainer(small_config(model=model, static_fraction=0.0, **density), scene))
     expected, layer = 0.0, system.model.deformation.layers[0]
     assert isinstance(layer, PlaneLayer)
     with torch.no_grad():
