@@ -69,14 +69,13 @@ def draw_block(
     block: Block, session: DeformationSession, renderer: Renderer, look: OutputOptions
 ) -> Iterator[tuple[int, bytes]]:
     """Yield the number and the encoded file of each frame."""
-    channels, options = default_channels(look.image_format), look.options
-    if options.motion_dt is not None:
-        channels += ("motion",)
+    channels, options, dt = default_channels(look.image_format), look.options, look.options.motion_dt
+    channels += () if dt is None else ("motion",)
     _, last = session.scene.metadata.time_range
     for number, camera, t in block.frames:
-        if look.options.motion_dt is not None:
+        if dt is not None:
             left = math.nextafter(last - t, 0.0)  # rounded down, so that t + left isn't after the last time
-            options = replace(options, motion_dt=min(look.options.motion_dt, left))
+            options = replace(options, motion_dt=min(dt, left))
         image = renderer.render(session, camera, t, options)
         yield number, encode(image, look.image_format, look.quality, channels)
 

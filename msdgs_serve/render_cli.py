@@ -104,6 +104,8 @@ def _run(options: argparse.Namespace) -> None:
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
     if options.dt is not None and (is_video or not FORMATS[image_format].holds_float):
         raise InvalidInput("--dt", "left out, as only exr and npy hold motion vectors", options.dt)
+    if options.dt is not None and not 0 < options.dt < math.inf:
+        raise InvalidInput("--dt", "above 0", options.dt)
     first = views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
     if is_video:
@@ -146,10 +148,9 @@ def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
 
 
 def _opened(scene: Path, options: argparse.Namespace) -> DeformationSession:
+    """Open a scene, and check that it has motion if that is to be drawn."""
     session = DeformationSession(scene)
     if options.dt is not None:
-        if not 0 < options.dt < math.inf:
-            raise InvalidInput("--dt", "above 0", options.dt)
         check_times(session, session.scene.metadata.time_range[0], motion_dt=0.0)
     return session
 
