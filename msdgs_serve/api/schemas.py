@@ -222,6 +222,7 @@ class RenderQuery(BaseModel):
     scene: Name | None = Field(default=None, description="optional if only one is served")
     min_psnr: LaxDecibels | None = Field(default=None, description="dB, as in `POST /render`")
     t: LaxNumber | None = Field(default=None, description="default: the scene's first time")
+    dt: LaxNumber | None = Field(default=None, description="scene time; `motion` needs it")
     steps: LaxSteps | None = Field(default=None, description="as in `POST /render`")
     width: LaxPixels | None = Field(default=None, description="pixels")
     height: LaxPixels | None = Field(default=None, description="pixels")

@@ -44,7 +44,7 @@ class MetricsLog:
         write_text(self._run / METRICS, "".join(json.dumps(line) + "\n" for line in kept))
         self.close()
         if self._tensorboard:
-            self._events = open_events(self._run / FOLDER, kept, step)
+            self._events = open_events(self._run / FOLDER, kept, step + 1 if keep_evaluations else step)
 
     def train(self, result: StepResult, seconds: float) -> None:
         """Add a line of training metrics."""

@@ -21,17 +21,19 @@ def require_tensorboard() -> None:
         raise ExtraMissing("--tensorboard", "tensorboard", "tensorboard") from None
 
 
-def open_events(folder: Path, lines: list[dict[str, Any]], keep_until: int) -> "SummaryWriter":
-    """Open a writer of event files in a folder. TensorBoard drops the steps after `keep_until` of earlier files.
+def open_events(folder: Path, lines: list[dict[str, Any]], purge_step: int) -> "SummaryWriter":
+    """Open a writer of event files in a folder. TensorBoard drops the steps from `purge_step` on of earlier files.
 
-    A new folder gets `lines`, those of `metrics.jsonl` up to that step: a resumed run may turn TensorBoard on.
+    `lines`, those that `metrics.jsonl` has kept, are written again from this step on; a new folder gets all of them,
+    as a resumed run may turn TensorBoard on.
     """
     from torch.utils.tensorboard import SummaryWriter
 
-    is_new = not folder.exists()
-    writer = SummaryWriter(str(folder), purge_step=keep_until + 1)
-    for line in lines if is_new else ():
-        add_scalars(writer, line)
+    first = purge_step if folder.exists() else 0
+    writer = SummaryWriter(str(folder), purge_step=purge_step)
+    for line in lines:
+        if line["step"] >= first:
+            add_scalars(writer, line)
     return writer
 
 

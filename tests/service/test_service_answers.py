@@ -113,6 +113,8 @@ def test_get_equals_post(client: httpx.Client):
     assert response.headers["Cache-Control"] == "no-cache"
     assert client.get(link, headers={"If-None-Match": response.headers["ETag"]}).status_code == 304
     assert client.get("/render").status_code == 200
+    motion = client.get(f"{link}&channels=motion&dt=0.2&format=npy")
+    assert motion.content == post(client, channels=["motion"], dt=0.2, format="npy").content
     look_at = client.get(f"/render?eye=5,0,0&target=0,0,0&up=0,0,1&fov_y=40&width={SIZE}&height={SIZE}&t=0.5")
     assert look_at.status_code == 200
     named = client.get("/render?camera=view_90&background=1,0,0&channels=rgb&format=webp&quality=80")
@@ -133,6 +135,7 @@ def test_get_equals_post(client: httpx.Client):
         ("surprise=1", "surprise"),
         ("elevation=90", "elevation"),
         ("index=99", "index"),
+        ("channels=motion", "dt"),
         ("camera=nope", "camera"),
         ("camera=view_0&index=1", "index"),
         ("eye=1,0,0&target=1,0,0", "target"),
@@ -159,6 +162,8 @@ def camera_path(*scales: float, **size: int) -> dict[str, Any]:
         ({"frames": [FILM_FRAME] * 4}, "frames"),
         ({"path": camera_path(1, 2, render_width=9, render_height=9)}, "path.camera_path.1.camera_to_world"),
         ({"path": camera_path(1, render_width=9)}, "path.render_height"),
+        ({"path": camera_path(1, render_width=1000, render_height=16000)}, "path.render_height"),
+        ({"path": camera_path(1), "width": 16000, "height": 1000}, "width"),
         ({"path": camera_path(1, 1, 1, 1), "width": 9, "height": 9}, "path.camera_path"),
     ],
     ids=lambda value: str(value)[:30],

@@ -117,7 +117,11 @@ def _path(service: Service, body: VideoRequest) -> tuple[ServedScene, CameraPath
     field, limits = "frames" if body.path is None else "path.camera_path", service.settings
     if len(path.frames) > limits.max_video_frames:
         raise InvalidInput(field, f"at most {limits.max_video_frames}", len(path.frames))
-    check_pixels(path.frames[0][0], len(path.frames), limits.max_pixels, limits.max_video_pixels, field)
+    try:
+        check_pixels(path.frames[0][0], len(path.frames), limits.max_pixels, limits.max_video_pixels, field)
+    except InvalidInput as error:
+        is_size_of_path = error.field != field and body.path is not None and size is None
+        raise (error.renamed(f"path.render_{error.field}") if is_size_of_path else error) from None
     return scene, path
 
 

@@ -83,6 +83,8 @@ def test_turned_on_by_a_resumed_run_it_has_all_steps(data: Path, tmp_path: Path)
 def test_held_out_renderings_at_every_evaluation(data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     fit(small_config(), data, run, tensorboard=True)
+    fit(small_config(), data, run, resume=True, tensorboard=True)  # finished: its last model is evaluated again
+    _assert_as_in_metrics(run)
     events = _events(run)
     shown = {f"test/r_{i:03d}" for i in range(RENDERS_PER_EVAL)} | {"val/r_000"}
     assert set(events.Tags()["images"]) == shown
