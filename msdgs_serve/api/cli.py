@@ -24,6 +24,9 @@ from msdgs_serve.store import SceneStore
 from msdgs_serve.threads import THREADS_VARIABLE
 
 USAGE_ERROR = 2
+SEND_BUFFER = 1 << 17
+"""Bytes of a response in the system's buffer. A larger one empties in steps that take a slow client longer than the
+time limit on reading, which then closes its connection although it reads."""
 SWITCH_SECONDS = 0.001
 """Switch interval of Python's interpreter. Under 4x overload the slowest accepted frames wait 0.7 times as long as with
 Python's default of 5 ms, and /live a quarter as long."""
@@ -135,6 +138,7 @@ def bind(host: str, port: int) -> socket.socket:
         listener = socket.socket(family, kind, protocol)
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
             listener.bind(address)
         except BaseException:
             listener.close()

@@ -40,6 +40,7 @@ def test_pods_have_probes_limits_and_few_rights(name: str):
     assert {"readinessProbe", "livenessProbe"} <= only.keys()
     assert {"cpu", "memory"} == only["resources"]["requests"].keys() == only["resources"]["limits"].keys()
     assert pod["securityContext"]["runAsNonRoot"]
+    assert pod["enableServiceLinks"] is False, "or MSDGS_PORT is the address of the Service msdgs"
     assert only["securityContext"]["readOnlyRootFilesystem"]
     assert only["securityContext"]["capabilities"] == {"drop": ["ALL"]}
 

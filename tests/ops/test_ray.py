@@ -62,7 +62,7 @@ def test_frames_are_the_same_bytes_and_are_not_drawn_twice(tmp_path: Path, capsy
     (tmp_path / "ray" / "frame_00004.png").unlink()
     assert main(on_ray) == 0
     printed = capsys.readouterr()
-    assert "8 of 9 frames are there already" in printed.out
+    assert "8 of 9 frames exist already" in printed.out
     assert "frame 1 of 1" in printed.err
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 import httpx
 import pytest
 
+from msdgs_serve.api.cli import bind
+from msdgs_serve.api.protocol import READ_BYTES
 from msdgs_serve.api.server import Server
 from tests.support.service import FRAME, MAX_SECONDS, connect, eventually, rest_of, serving
 
@@ -91,6 +93,12 @@ def test_a_reader_that_stands_still_is_closed(client: httpx.Client, server: list
     assert connection.recv(100).startswith(b"HTTP/1.1 200")
     eventually(lambda: len(server[0].server_state.connections) <= before)
     connection.close()
+
+
+def test_a_slow_reader_is_seen_to_read():
+    """A large buffer empties in steps that are farther apart than the time limit."""
+    with bind("127.0.0.1", 0) as listener:
+        assert listener.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF) <= 4 * READ_BYTES
 
 
 @pytest.mark.parametrize(
