@@ -154,7 +154,8 @@ class Run:
         if self.clock and self.trainer.step_count < self.config.run.steps:
             self._compile_kernels()
         status = self._train()
-        self._save()
+        if not (status == "interrupted" and self.trainer.is_skipping and (self.folder / CHECKPOINT).exists()):
+            self._save()
         metrics = {}
         if status != "interrupted":
             metrics = {split: self._evaluate(split, renders=None) for split in self.splits}

@@ -127,8 +127,9 @@ class Schedule(NamedTuple):
 
 def require_same_phase(before: Schedule, after: Schedule, step: int) -> None:
     """Raise `InvalidInput` unless a run that has taken `step` steps can go on with another number of them: layers are
-    initialized where motion begins and where the time window grows."""
-    if (before.deforms(step), before.window(step)) != (after.deforms(step), after.window(step)):
+    initialized where motion begins and where the time window grows, and trained bands of color stay in use."""
+    moved = (before.deforms(step), before.window(step)) != (after.deforms(step), after.window(step))
+    if moved or after.sh_degree(step) < before.sh_degree(step):
         expected = f"{before.num_steps:,}, or so near it that step {step:,} stays in its phase"
         raise InvalidInput("config.steps", expected, f"{after.num_steps:,}")
 

@@ -123,8 +123,8 @@ class PlaneGrid(nn.Module):
         self.time[:, high + 1 : new_high + 1] = self.time[:, high : high + 1]
 
     def time_smoothness(self) -> Tensor:
-        """Mean squared second difference along time."""
-        return self.time.diff(n=2, dim=1).square().mean()
+        """Mean squared second difference along time, 0 for two nodes."""
+        return _mean_square(self.time.diff(n=2, dim=1))
 
     def l1_time_planes(self) -> Tensor:
         """Mean distance of the planes over time from 1, their neutral value."""
@@ -135,8 +135,12 @@ class PlaneGrid(nn.Module):
         return self.space.diff(dim=1).square().mean() + self.space.diff(dim=2).square().mean()
 
     def plane_smoothness(self) -> Tensor:
-        """Mean squared second difference along space, the sum of both axes of a plane."""
-        return self.space.diff(n=2, dim=1).square().mean() + self.space.diff(n=2, dim=2).square().mean()
+        """Mean squared second difference along space, the sum of both axes of a plane; 0 for two nodes a side."""
+        return _mean_square(self.space.diff(n=2, dim=1)) + _mean_square(self.space.diff(n=2, dim=2))
+
+
+def _mean_square(differences: Tensor) -> Tensor:
+    return differences.square().mean() if differences.numel() else differences.sum()
 
 
 class PlaneLayer(DeformationLayer):

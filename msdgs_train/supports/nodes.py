@@ -123,13 +123,16 @@ class NodesSupport(Support):
 
     @torch.no_grad()
     def initialize_nodes(self, means: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-        """Farthest-point sampling of the opaque Gaussians; returns the initial skinning logits and node ids, [N, F].
+        """Farthest-point sampling of the opaque Gaussians, or of all if few are; returns initial skinning logits and
+        node ids, [N, F].
 
         Args:
             means: [N, 3].
             opacities: [N] in (0, 1).
         """
-        opaque = means[opacities > NODE_MIN_OPACITY] if bool((opacities > NODE_MIN_OPACITY).any()) else means
+        opaque = means[opacities > NODE_MIN_OPACITY]
+        if len(opaque) < 2 * len(self.nodes):  # too few to choose from
+            opaque = means
         chosen = int((opaque - opaque.mean(dim=0)).norm(dim=1).argmin())
         distances = opaque.new_full((len(opaque),), torch.inf)
         for k in range(len(self.nodes)):

@@ -39,7 +39,11 @@ register_system(
         background="white",
         init_num_pts=2_000,
         static_fraction=3_000 / 23_000,
+        sh_degree_fraction=1_000 / 23_000,
+        refine_start_fraction=500 / 23_000,
         refine_stop_fraction=15_000 / 23_000,
+        refine_every_fraction=100 / 23_000,
+        reset_every_fraction=3_000 / 23_000,
         ssim_lambda=0.0,
     ),
 )

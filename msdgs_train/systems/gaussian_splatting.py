@@ -99,7 +99,8 @@ class GaussianSplatting:
         if c.alpha_weight:
             loss = loss + c.alpha_weight * target.alpha_error(alpha)
         clamped = count_clamped(self.config.model.scale_space, posed.scales)
-        return ViewLoss(loss, rgb, clamped, info, target.shows_all)
+        shows_all = target.shows_all and not self.config.model.opacity_head  # else opacity 0 at this time hides some
+        return ViewLoss(loss, rgb, clamped, info, shows_all)
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
         for frame, view in views:

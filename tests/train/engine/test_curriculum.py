@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import Frame, SceneData, load_scene
 from msdgs_train.engine.curriculum import (
     MIN_NEW_FRAME_DISTANCE,
@@ -14,7 +15,7 @@ from msdgs_train.engine.curriculum import (
     WindowCurriculum,
     distances_from_middle,
 )
-from msdgs_train.engine.schedule import Schedule
+from msdgs_train.engine.schedule import Schedule, require_same_phase
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.spline import SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
@@ -123,3 +124,13 @@ def test_phases_follow_each_other_and_cover_the_run() -> None:
     ]
     static = config.updated(model=ModelConfig(layers=(), embedding_dim=0))
     assert [tuple(phase) for phase in Schedule.from_config(static).phases()] == [("static, all images", 0, 1000)]
+
+
+def test_trained_bands_of_color_stay_in_use() -> None:
+    """Of 3,300 steps the first 3,000 train degree 3, of 9,000 degree 1."""
+    static = small_config(steps=3000, sh_degree_fraction=0.3, model=ModelConfig(layers=(), embedding_dim=0))
+    before, near, far = (Schedule.from_config(static.updated(steps=steps)) for steps in (3000, 3300, 9000))
+    assert [schedule.sh_degree(3000) for schedule in (before, near, far)] == [3, 3, 1]
+    require_same_phase(before, near, 3000)
+    with pytest.raises(InvalidInput, match=r"config\.steps"):
+        require_same_phase(before, far, 3000)

@@ -52,3 +52,19 @@ def test_an_image_with_an_empty_border_shows_everything() -> None:
         cut[(*place, 3)] = 1
         assert not Target.over(cut, torch.zeros(3)).shows_all
     assert not Target.over(np.zeros_like(rgba), torch.zeros(3)).shows_all, "all of it may be outside"
+
+
+def test_with_an_opacity_head_an_image_never_shows_everything(data: Path) -> None:
+    """A Gaussian may be transparent at the image's time alone."""
+    scene, white = load_scene(data), torch.ones(3)
+    frame = scene.splits["train"][0]
+    rgba = frame.load_rgba().copy()
+    rgba[[0, -1]] = rgba[:, [0, -1]] = 0
+    rgba[1:-1, 1:-1, 3] = 255
+    shown = [
+        GaussianSplatting(Schedule.from_config(small_config(opacity_head=head)), scene)
+        .loss(frame, Target.over(rgba, white), white, 0)
+        .shows_all
+        for head in (False, True)
+    ]
+    assert shown == [True, False]

@@ -10,6 +10,7 @@ import torch
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.schedule import Schedule
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
@@ -48,6 +49,14 @@ def in_millions(count: float) -> float:
 )
 def test_published_numbers_of_parameters(name: str, deformation: int) -> None:
     assert sizes(preset(name).model)[0] == deformation
+
+
+def test_published_schedules() -> None:
+    for name in ("deformgs", "4dgs"):
+        schedule = Schedule.from_config(preset(name))
+        assert schedule.sh_degree_interval == 1_000
+        assert (schedule.refine_start, schedule.refine_every, schedule.refine_stop) == (500, 100, 15_000)
+        assert (schedule.static_steps, schedule.reset_every) == (3_000, 3_000)
 
 
 def test_table_4() -> None:

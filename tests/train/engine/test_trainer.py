@@ -247,6 +247,28 @@ def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
     load_model(run / "model.pt")
 
 
+class _StopsAt(Observer):
+    def __init__(self, step: int) -> None:
+        self.at, self.last = step, 0
+
+    def step(self, result: StepResult, seconds: float) -> None:
+        self.last = result.step
+
+    def should_stop(self) -> bool:
+        return self.last >= self.at
+
+
+@pytest.mark.usefixtures("no_curve")
+def test_an_interruption_while_steps_are_skipped_keeps_the_last_good_checkpoint(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _break_losses(monkeypatch, range(13, 25))
+    config, run = small_config(steps=30, checkpoint_every=10, eval_every=0), tmp_path / "run"
+    assert fit(config, data, run, observer=_StopsAt(16)).status == "interrupted"
+    assert torch.load(run / "checkpoint.pt", weights_only=True)["step_count"] == 10
+    assert fit(config, data, run, resume=True).status == "finished"
+
+
 @pytest.mark.usefixtures("no_curve")
 def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -142,6 +142,14 @@ def test_nodes_are_spread_among_opaque_gaussians() -> None:
     assert torch.equal(ids.gather(1, logits.argmax(dim=1, keepdim=True)), nearest[:, :1])
 
 
+def test_few_opaque_gaussians_are_no_places_for_many_nodes() -> None:
+    means, opacities = torch.rand(100, 3, generator=torch.Generator().manual_seed(3)), torch.full((100,), 0.1)
+    opacities[:5] = 0.9
+    support = NodesSupport(NodesConfig(num_nodes=20))
+    support.initialize_nodes(means, opacities)
+    assert len(support.nodes.unique(dim=0)) == 20
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_fewer_gaussians_than_nodes(count: int) -> None:
     support = NodesSupport(NodesConfig(num_nodes=12))

@@ -112,3 +112,9 @@ def test_flat_grids_and_straight_lines_in_time_are_smooth() -> None:
         assert float(planes.l1_time_planes()) == pytest.approx(2 + 1 / 9)
         assert float(planes.plane_tv()) == pytest.approx(2 / 31)
         assert float(planes.plane_smoothness()) == pytest.approx((1 + 4 + 1) / 30)
+
+
+def test_two_nodes_have_no_second_difference() -> None:
+    planes = PlaneGrid(4, 2, 2, 1.0, (0.0, 1.0))
+    with torch.no_grad():
+        assert float(planes.time_smoothness()) == float(planes.plane_smoothness()) == 0
