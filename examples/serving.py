@@ -16,6 +16,7 @@ from typing import Any
 HOST = "127.0.0.1"
 START_SECONDS = 600.0  # the first start of a fresh install compiles the kernels, slowly on a busy core
 ANSWER_SECONDS = 60.0
+LOCAL = urllib.request.build_opener(urllib.request.ProxyHandler({}))  # not through the proxy of `http_proxy`
 
 
 @contextlib.contextmanager
@@ -64,7 +65,7 @@ def say(text: str) -> None:
 
 def _fetch(request: urllib.request.Request) -> bytes:
     try:
-        with urllib.request.urlopen(request, timeout=ANSWER_SECONDS) as answer:
+        with LOCAL.open(request, timeout=ANSWER_SECONDS) as answer:
             return answer.read()
     except urllib.error.HTTPError as error:
         raise SystemExit(f"{request.full_url} answered {error.code}: {error.read().decode()}") from None
@@ -75,7 +76,7 @@ def _wait_until_ready(url: str, process: subprocess.Popen[bytes]) -> None:
     while time.monotonic() < deadline:
         if process.poll() is not None:
             raise SystemExit(f"the service ended with exit code {process.returncode}")
-        with contextlib.suppress(OSError), urllib.request.urlopen(f"{url}/ready", timeout=5):
+        with contextlib.suppress(OSError), LOCAL.open(f"{url}/ready", timeout=5):
             return
         time.sleep(0.1)
     raise SystemExit(f"the service did not answer within {START_SECONDS:.0f} s")

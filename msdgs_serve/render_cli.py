@@ -31,7 +31,7 @@ from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
 from msdgs_serve.scene import InvalidInput, MsdgsError
-from msdgs_serve.video import VideoFormat, check_size, check_video, write_video
+from msdgs_serve.video import VIDEO_FORMATS, VideoFormat, check_size, require_pyav, write_video
 
 PROGRAM = "msdgs-render"
 USAGE_ERROR = 2
@@ -95,10 +95,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(options: argparse.Namespace) -> None:
-    video = options.out.suffix.lstrip(".")
+    video = "" if options.out.is_dir() else options.out.suffix.lstrip(".")
     is_video = bool(video)
     if is_video:
-        check_video(video)
+        if video not in VIDEO_FORMATS:
+            names = " or ".join(f".{name}" for name in VIDEO_FORMATS)
+            expected = f"a folder (of a name with a dot: an existing one), or a video named {names}"
+            raise InvalidInput("OUT", expected, options.out.name)
+        require_pyav()
     views, fps = _views(options)
     image_format = cast(ImageFormat, "png" if is_video else options.format)
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)

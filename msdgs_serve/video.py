@@ -56,10 +56,8 @@ class VideoUnavailable(MsdgsError):
     """PyAV is not installed."""
 
 
-def check_video(video_format: str) -> None:
-    """Raise `InvalidInput` for an unknown format, and `VideoUnavailable` without PyAV."""
-    if video_format not in VIDEO_FORMATS:
-        raise InvalidInput("format", f"one of {', '.join(VIDEO_FORMATS)}", video_format)
+def require_pyav() -> None:
+    """Raise `VideoUnavailable` without PyAV."""
     try:
         import av  # noqa: F401  # an optional dependency
     except ImportError:

@@ -63,10 +63,11 @@ def convert(options: ConvertOptions, console: Console) -> None:
         t0, _ = session.scene.metadata.time_range
         worst = _one(session, options, out, t0 if options.t is None else options.t)
         written = f"{_megabytes(out)}, {worst:.1f} dB"
-    elif not out.suffix:
+    elif not out.suffix or out.is_dir():
         written = _sequence(session, options, console)
     else:
-        raise InvalidInput("out", f"a folder, or named {', '.join((*SINGLE, *USD, ONNX))} or {VISIONARY}", out.name)
+        names = f"{', '.join((*SINGLE, *USD, ONNX))} or {VISIONARY}"
+        raise InvalidInput("out", f"a folder (of a name with a dot: an existing one), or named {names}", out.name)
     console.print(f"{out}: {written} against the scene", markup=False)
     eps2d = session.scene.metadata.eps2d
     if eps2d != GSPLAT.eps2d:
@@ -82,7 +83,7 @@ def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: fl
         if file.suffix == ".spz":
             write_spz(temporary, gaussians, metadata.antialiasing)
         elif file.suffix == ".ply":
-            write_ply(temporary, gaussians)
+            write_ply(temporary, gaussians, metadata.antialiasing)
         else:
             write_gltf(temporary, gaussians, framing(metadata).up)
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians

@@ -9,6 +9,7 @@ import numpy as np
 
 from export.importers.scene import UP
 from export.importers.splats.axes import from_right_up_back, upright
+from msdgs_serve.imaging.image import srgb_to_linear
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
@@ -16,7 +17,7 @@ from msdgs_serve.scene.spherical_harmonics import SH_C0
 EXTENSION = "KHR_gaussian_splatting"
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAX_BYTES = 2**32 - 1
-FLOAT, BYTE, POINTS, VERTICES = 5126, 5121, 0, 34962
+FLOAT, SHORT, POINTS, VERTICES = 5126, 5123, 0, 34962
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 COLUMNS = {name: columns for columns, name in TYPES.items()}
 PRIMITIVE = {
@@ -36,10 +37,11 @@ def write_gltf(file: Path, gaussians: Gaussians, up: np.ndarray = UP) -> None:
     if not len(gaussians):
         raise InvalidInput("scene", "of one or more Gaussians for glTF", 0)
     means, quats, sh = from_right_up_back(gaussians.means, gaussians.quats, gaussians.sh)
-    colors = np.concatenate([SH_C0 * sh[:, 0] + 0.5, gaussians.opacities[:, None]], axis=1)
+    linear = srgb_to_linear((SH_C0 * sh[:, 0] + 0.5).clip(0, 1))
+    colors = np.concatenate([linear, gaussians.opacities[:, None]], axis=1)
     attributes = {
         "POSITION": means,
-        "COLOR_0": np.round(255 * colors.clip(0, 1)).astype(np.uint8),
+        "COLOR_0": np.round(65535 * colors).astype("<u2"),
         f"{EXTENSION}:ROTATION": quats[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": gaussians.scales,
         f"{EXTENSION}:OPACITY": gaussians.opacities,
@@ -47,7 +49,7 @@ def write_gltf(file: Path, gaussians: Gaussians, up: np.ndarray = UP) -> None:
     }
     accessors, views, parts, at = [], [], [], 0
     for name, values in attributes.items():
-        part = np.ascontiguousarray(values, values.dtype if values.dtype == np.uint8 else "<f4")
+        part = np.ascontiguousarray(values, values.dtype if values.dtype == np.uint16 else "<f4")
         views.append({"buffer": 0, "byteOffset": at, "byteLength": part.nbytes, "target": VERTICES})
         accessors.append(_accessor(name, part, len(views) - 1))
         parts.append(part.tobytes())
@@ -108,7 +110,7 @@ def _primitive(names: list[str]) -> dict[str, Any]:
 def _accessor(name: str, part: np.ndarray, view: int) -> dict[str, Any]:
     columns = part.shape[1] if part.ndim == 2 else 1
     accessor = {"bufferView": view, "count": len(part), "type": TYPES[columns]}
-    accessor |= {"componentType": FLOAT} if part.dtype != np.uint8 else {"componentType": BYTE, "normalized": True}
+    accessor |= {"componentType": FLOAT} if part.dtype != np.uint16 else {"componentType": SHORT, "normalized": True}
     if name == "POSITION":
         accessor |= {"min": part.min(axis=0).tolist(), "max": part.max(axis=0).tolist()}
     return accessor

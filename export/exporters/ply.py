@@ -6,11 +6,13 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 
 from export.importers.splats.base import logit
+from export.importers.splats.ply import RENDER_MODE
 from msdgs_serve.scene.gaussians import Gaussians
 
 
-def write_ply(file: Path, gaussians: Gaussians) -> None:
-    """Write all Gaussians in storage space: logits of opacities, log-scales, wxyz quaternions; normals are 0."""
+def write_ply(file: Path, gaussians: Gaussians, antialiasing: str = "dilate") -> None:
+    """Write all Gaussians in storage space: logits of opacities, log-scales, wxyz quaternions; normals are 0. A comment
+    tells `mip` anti-aliasing, as in files of Brush."""
     rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)  # by channel
     columns = {
         **_columns("xyz", gaussians.means),
@@ -24,7 +26,8 @@ def write_ply(file: Path, gaussians: Gaussians) -> None:
     rows = np.empty(len(gaussians), [(name, "<f4") for name in columns])
     for name, values in columns.items():
         rows[name] = values
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(file))
+    comments = [f"{RENDER_MODE} mip"] if antialiasing == "mip" else []
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments).write(str(file))
 
 
 def _columns(names: str | list[str], values: np.ndarray) -> dict[str, np.ndarray]:

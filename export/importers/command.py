@@ -38,6 +38,8 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
     if file_format == "model":
         yield path / "model.pt" if path.is_dir() else path
     elif file_format in RUNS:
+        if file_format == "4dgs" and options.data is not None and (options.data / "dataset.json").exists():
+            raise InvalidInput("data", "left out: 4DGaussians trains in HyperNeRF's unscaled coordinates", options.data)
         with tempfile.TemporaryDirectory(prefix="msdgs-import-") as folder:
             model = Path(folder) / "model.pt"
             lost = write_model(path, file_format, model, console)

@@ -62,14 +62,15 @@ def _find_cameras(folder: Path) -> dict[str, list[Path]]:
 
 def _find_files(folder: Path, name: str) -> list[Path]:
     for place in (folder / name / "images", folder / name):
-        files = [path for path in place.glob("*") if path.suffix.lower() in EXTENSIONS and path.is_file()]
+        shown = (path for path in place.glob("*") if not path.name.startswith("."))
+        files = [path for path in shown if path.suffix.lower() in EXTENSIONS and path.is_file()]
         if files:
             return sorted(files, key=lambda path: _natural(path.name))
-    video = folder / f"{name}{VIDEO}"
-    if not video.is_file():
-        problem = f"are missing: there is no {video.name} and no {'|'.join(EXTENSIONS)}"
+    videos = [path for path in folder.glob(f"{name}.*") if path.suffix.lower() == VIDEO and path.is_file()]
+    if not videos:
+        problem = f"are missing: there is no {name}{VIDEO} and no {'|'.join(EXTENSIONS)}"
         raise DatasetInvalid(folder / name, "frames", problem)
-    return [video]
+    return videos[:1]
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
@@ -80,7 +81,7 @@ def _natural(name: str) -> list[tuple[int, str]]:
 def _view(file: Path, row: int, name: str, files: list[Path], pose: np.ndarray, size: int | None) -> list[Frame]:
     """Read all frames of one camera, in the order of time."""
     first = files[0]
-    if first.suffix == VIDEO:
+    if first.suffix.lower() == VIDEO:
         count, *image = read_info(first)
         camera = reduced(_camera(file, row, pose, ImageSize(*image)), size, first)
         return [

@@ -70,3 +70,5 @@ def _module(name: str, package: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         raise Unavailable(f"{package} isn't installed: pip install {package}") from None
+    except (OSError, RuntimeError) as error:  # a build for another version of torch
+        raise Unavailable(f"{package} can't be used: {error}") from None

@@ -32,6 +32,8 @@ class SceneInfo:
     OpenCV) and t."""
     training_cameras: list[dict[str, Any]] = field(default_factory=list)
     """Others, of training images, from which export also measures errors."""
+    size: int | None = None
+    """Width in pixels to which images were reduced, as in `DataConfig`."""
     llffhold: int = 0
     """Every so many images were held out, as in `DataConfig`."""
 
@@ -114,6 +116,10 @@ def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
                 SceneCamera.from_plain(camera)
         except (LookupError, TypeError, ValueError, MsdgsError) as error:
             raise CheckpointInvalid(path, f"scene.{name} holds a camera that can't be used: {error}") from error
+    for name in ("size", "llffhold"):
+        value = getattr(scene, name)
+        if type(value) is not int and (name, value) != ("size", None):
+            raise CheckpointInvalid(path, f"scene.{name} must be a whole number, got {value!r}")
     for name, shape in (("time_range", (2,)), ("background", (3,)), ("bounds", (2, 3))):
         try:
             values = torch.tensor(getattr(scene, name), dtype=torch.float64)

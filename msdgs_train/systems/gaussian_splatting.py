@@ -148,6 +148,7 @@ class GaussianSplatting:
             ),
             cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in shown],
             training_cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in others[len(shown) :]],
+            size=self.config.data.size,
             llffhold=self.config.data.llffhold,
         )
 

@@ -151,6 +151,11 @@ def test_each_preset_exports(name: str, data: Path, tmp_path: Path):
         np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))
 
 
+def test_images_are_as_wide_as_those_of_the_run(data: Path):
+    full, half = (HeldOutImages(data, SceneInfo(size=n), lambda _: lambda: None).training for n in (None, 16))
+    assert half[0].width == 16 < full[0].width
+
+
 def test_images_that_the_run_held_out_are_no_training_images(data: Path):
     counts = [len(HeldOutImages(data, SceneInfo(llffhold=n), lambda _: lambda: None).training) for n in (0, 3)]
     assert counts[1] < counts[0]

@@ -29,9 +29,11 @@ from export.options import ConvertOptions
 from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
+from msdgs_serve.imaging.image import srgb_to_linear
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
+from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.gaussians.model_file import SceneInfo
 from tests.support.models import MLP, NODES, SCENE, random_model
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
@@ -77,13 +79,22 @@ def test_a_sequence_covers_the_scenes_time(tmp_path: Path):
         run(scene, tmp_path / "frames", frames=3)
 
 
+def test_a_folder_may_have_a_dot_in_its_name(tmp_path: Path):
+    scene, out = scene_file(tmp_path), tmp_path / "frames.v2"
+    with pytest.raises(InvalidInput, match=r"a folder \(of a name with a dot: an existing one\)"):
+        run(scene, out, frames=2)
+    out.mkdir()
+    run(scene, out, frames=2)
+    assert len(list(out.iterdir())) == 2
+
+
 def test_an_interrupted_sequence_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scene, written = scene_file(tmp_path), []
 
-    def write_two(file: Path, gaussians: Gaussians) -> None:
+    def write_two(file: Path, gaussians: Gaussians, antialiasing: str) -> None:
         if len(written) == 2:
             raise KeyboardInterrupt
-        write_ply(file, gaussians)
+        write_ply(file, gaussians, antialiasing)
         written.append(file)
 
     with monkeypatch.context() as patch:
@@ -121,7 +132,9 @@ def test_spz_keeps_what_eight_bits_can(tmp_path: Path, antialiasing: str):
         if entry.key == "antialiasing":
             entry.value = f'"{antialiasing}"'
     onnx.save(contents, scene)
-    run(scene, tmp_path / "a.spz")  # compares images, and refuses less than 45 dB
+    for name in ("a.spz", "a.ply"):
+        run(scene, tmp_path / name)  # compares images, and refuses less than 45 dB
+    assert read_splats(tmp_path / "a.ply").antialiasing == antialiasing
     read = read_splats(tmp_path / "a.spz")
     assert read.antialiasing == antialiasing
     expected = DeformationSession(scene).gaussians(0.0)
@@ -156,6 +169,13 @@ def test_gltf_holds_one_time(tmp_path: Path, degree: int):
     assert {"mode": 0, "kernel": "ellipse"}.items() <= {**primitive, **primitive["extensions"][EXTENSION]}.items()
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
     assert (20 + text) % 4 == 0
+    color = document["accessors"][primitive["attributes"]["COLOR_0"]]
+    start = 28 + text + document["bufferViews"][color["bufferView"]]["byteOffset"]
+    linear = np.frombuffer(contents, "<u2", 4 * color["count"], start).reshape(-1, 4) / 65535
+    g = DeformationSession(scene).gaussians(0.4)
+    encoded = np.column_stack([g.sh[:, 0] * SH_C0 + 0.5, g.opacities]).clip(0, 1)
+    assert np.abs(linear[:, :3] - srgb_to_linear(encoded[:, :3])).max() < 1 / 65535
+    assert np.abs(linear[:, 3] - encoded[:, 3]).max() < 1 / 65535
 
 
 def test_what_gltf_cannot_hold_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -330,7 +350,7 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
     ("plan", "out", "message"),
     [
         ("network", "a.mp4", r"msdgs-render"),
-        ("network", "a.obj", r"a folder, or named .ply, .spz, .glb, .usdc, .usda, .usd, .onnx or .visionary.onnx"),
+        ("network", "a.obj", r"or named .ply, .spz, .glb, .usdc, .usda, .usd, .onnx or .visionary.onnx"),
         ("int8", "a.visionary.onnx", r"--plan compact:65"),
     ],
 )

@@ -1,6 +1,7 @@
 """Import of splat files of other programs, and errors that name the faults of invalid ones."""
 
 import gzip
+import json
 import os
 import struct
 import tracemalloc
@@ -32,6 +33,7 @@ from tests.support import reference
 from tests.support.images import psnr
 from tests.support.splat_files import (
     FORMATS,
+    compressed_ply_bytes,
     drawn,
     inria_columns,
     ply_bytes,
@@ -161,6 +163,34 @@ def test_a_sog_reads_no_files_outside_of_its_folder(tmp_path: Path):
     (folder / "meta.json").write_text(meta.replace('"quats.webp"', '"../sog/quats.webp"'))
     with pytest.raises(ImportFailed, match=r"`quats.files` must be a list of 1 names of files beside it"):
         read_splats(folder)
+
+
+@pytest.mark.parametrize(
+    ("said", "read"), [({"model": "antialiased"}, "mip"), ({"antialias": True}, "mip"), ({"model": "2dgs"}, "dilate")]
+)
+def test_a_sog_may_be_anti_aliased(tmp_path: Path, said: dict[str, Any], read: str):
+    meta = write_sog(tmp_path / "sog", some_gaussians(20, 0)) / "meta.json"
+    meta.write_text(json.dumps(json.loads(meta.read_text()) | said))
+    assert read_splats(tmp_path / "sog").antialiasing == read
+
+
+@pytest.mark.parametrize(
+    ("comments", "read"),
+    [
+        (["Exported from Brush", "SplatRenderMode: mip"], "mip"),
+        (["antialiased 1"], "mip"),
+        (["antialiased 0"], "dilate"),
+        (["antialiased 1", "SplatRenderMode: default"], "dilate"),
+        ([], "dilate"),
+    ],
+)
+@pytest.mark.parametrize("is_compressed", [False, True])
+def test_a_ply_may_be_anti_aliased(tmp_path: Path, is_compressed: bool, comments: list[str], read: str):
+    g = some_gaussians(20, 0)
+    contents = compressed_ply_bytes(g) if is_compressed else ply_bytes(inria_columns(g))
+    header = "".join(f"comment {comment}\n" for comment in comments)
+    (tmp_path / "a.ply").write_bytes(contents.replace(b"element", header.encode() + b"element", 1))
+    assert read_splats(tmp_path / "a.ply").antialiasing == read
 
 
 def test_a_sog_named_by_its_meta_json_is_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -13,6 +13,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from export.importers.command import model_or_import
 from export.importers.detect import detect_format
 from export.importers.errors import ImportFailed
 from export.importers.runs import base
@@ -24,6 +25,7 @@ from export.options import ExportOptions
 from export.plans.registry import build
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model
@@ -256,6 +258,26 @@ def test_cameras_that_cannot_be_are_refused_by_the_name_of_their_file(tmp_path: 
     run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)))
     (run / "cameras.json").write_text(contents)
     assert_refused(run, "4dgs", r"cameras.json: isn't a list of cameras")
+
+
+@pytest.mark.parametrize("has_cameras", [True, False])
+def test_the_width_of_images_is_that_of_the_runs_cameras(tmp_path: Path, has_cameras: bool):
+    run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)))
+    if not has_cameras:
+        (run / "cameras.json").unlink()
+    imported(run, "4dgs")
+    size = load_model(tmp_path / "model.pt").scene.size
+    assert size == (foreign.stored_camera(0)["width"] if has_cameras else None)
+
+
+def test_images_of_another_world_are_refused(tmp_path: Path):
+    run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)))
+    (tmp_path / "dataset.json").write_text("{}")
+    with (
+        pytest.raises(InvalidInput, match="unscaled coordinates"),
+        model_or_import(ExportOptions(run, data=tmp_path), QUIET),
+    ):
+        pass
 
 
 def network_of(run: Path) -> Path:

@@ -236,7 +236,7 @@ def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
         (["scene", "out", "--path", "missing.json"], "missing.json"),
         (["scene", "out", "--frames", "0"], "--frames"),
         (["scene", "out", "--width", "10"], "--height"),
-        (["scene", "video.gif"], "mp4, webm, webp"),
+        (["scene", "video.gif"], "or a video named .mp4 or .webm or .webp"),
         (["scene", "video.mp4", "--transparent"], "--transparent"),
         (["scene", "video.mp4", "--fps", "0.0001"], "fps"),
         (["scene", "video.mp4", "--fps", "0"], "fps"),
@@ -259,6 +259,12 @@ def test_errors_are_one_line(
     assert message in complaint
     assert complaint.count("\n") == 1
     assert not list(Path().glob("*.frames")), "before frames are drawn"
+
+
+def test_a_folder_may_have_a_dot_in_its_name(scene: Path, tmp_path: Path):
+    (tmp_path / "shot.v2").mkdir()
+    assert run(scene, tmp_path / "shot.v2", "--frames", 1, "--width", 8, "--height", 8) == 0
+    assert (tmp_path / "shot.v2" / "frame_00000.png").exists()
 
 
 def test_a_wrong_number_of_threads_is_named(

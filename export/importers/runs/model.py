@@ -62,10 +62,12 @@ def write_model(run: Path, file_format: str, output: Path, console: Console) -> 
         with _usable(run, f" at t = {t:g}"):
             posed(model, t).validate()
     metadata = metadata_of(source.gaussians.means, source.gaussians.sh_degree, "0" * 64)
+    cameras = _cameras(run / "cameras.json")
     info = SceneInfo(
         background=WHITE if folder.settings.get("white_background", importer.white_background) else BLACK,
         bounds=[list(b) for b in metadata.bounds],
-        cameras=_cameras(run / "cameras.json") or [camera.to_plain() for camera in metadata.cameras],
+        cameras=cameras or [camera.to_plain() for camera in metadata.cameras],
+        size=int(cameras[0]["width"]) if cameras else None,
     )
     console.print(f"{run}: iteration {iteration:,}, {len(source):,} Gaussians", markup=False)
     with console.status("comparing frames"), _usable(run):

@@ -1,6 +1,8 @@
 """PLY files of INRIA's trainer, with properties in any order, and SuperSplat's compressed PLY files."""
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +21,9 @@ CHUNK = 256
 MIN_TEXT_BYTES = 2
 """Bytes of the shortest number in a text file: a digit and a separator."""
 
+RENDER_MODE = "SplatRenderMode:"
+"""Begins Brush's comment on anti-aliasing, which goes on with `mip` or `default`."""
+
 _SIZES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _SIZES |= {"int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4, "float64": 8}
 
@@ -34,8 +39,22 @@ def read_ply(file: Path) -> Splats:
     if "vertex" not in elements:
         raise ImportFailed(file, f"has no element `vertex`, only {', '.join(elements) or 'none'}")
     if "packed_position" in elements["vertex"].data.dtype.names:
-        return _compressed(file, elements)
-    return _inria(file, elements["vertex"])
+        read = _compressed(file, elements)
+    else:
+        read = _inria(file, elements["vertex"])
+    return replace(read, antialiasing=_antialiasing(contents.comments))
+
+
+def _antialiasing(comments: Sequence[str]) -> str:
+    """`mip` if Brush's or Postshot's comment says so, the last one if there are several."""
+    found = "dilate"
+    for comment in comments:
+        match comment.lower().split():
+            case [name, mode] if name == RENDER_MODE.lower():
+                found = "mip" if mode == "mip" else "dilate"
+            case ["antialiased", flag]:
+                found = "mip" if flag == "1" else "dilate"
+    return found
 
 
 class _Element(NamedTuple):

@@ -147,7 +147,9 @@ def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
     if meta.get("shN") is not None:
         sh = np.concatenate([sh, _harmonics(path, meta, count, texture)], axis=1)
     quats = texture(meta.files("quats", 1)[0], count)
-    return splats(path, means, meta.numbers("scales.codebook", 256)[scales], _quats(quats), colors[:, 3] / 255, sh)
+    is_mip = meta.get("model") == "antialiased" or meta.get("antialias") is True
+    scales = meta.numbers("scales.codebook", 256)[scales]
+    return splats(path, means, scales, _quats(quats), colors[:, 3] / 255, sh, "mip" if is_mip else "dilate")
 
 
 def _quats(stored: np.ndarray) -> np.ndarray:

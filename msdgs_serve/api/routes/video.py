@@ -20,7 +20,7 @@ from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import RenderOptions, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
-from msdgs_serve.video import VIDEO_FORMATS, VideoWriter, check_video
+from msdgs_serve.video import VIDEO_FORMATS, VideoWriter, require_pyav
 
 router = APIRouter(tags=["frames"])
 
@@ -37,7 +37,7 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
 
     For long videos use `msdgs-render` on the machine itself, which shows its progress and can be resumed.
     """
-    check_video(body.format)
+    require_pyav()
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
     stream = _stream_video(service, body, scene, path)
     first = await unless_gone(request, anext(stream))  # an error in the first frame still gets its status

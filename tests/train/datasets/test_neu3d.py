@@ -27,6 +27,16 @@ def image(camera: int, index: int) -> np.ndarray:
     return layouts.flat(layouts.neu3d_color(camera, index), SMALL)
 
 
+def test_names_in_capitals_and_hidden_files(tmp_path: Path):
+    """Action cameras write `.MP4`, and macOS a `._` file beside each file in an archive."""
+    for name in ("videos", "images"):
+        (tmp_path / name).mkdir()
+    videos, images = write_neu3d_videos(tmp_path / "videos"), write_neu3d(tmp_path / "images")
+    (videos / "cam00.mp4").rename(videos / "cam00.MP4")
+    (images / "cam00" / "._0000.png").write_bytes(b"no image")
+    assert [len(load_scene(folder).splits["test"]) for folder in (videos, images)] == [COUNT, 2]
+
+
 def test_splits_times_and_pixels_of_videos(tmp_path: Path):
     scene = load_scene(write_neu3d_videos(tmp_path))
     assert [len(scene.splits[split]) for split in ("train", "val", "test")] == [2 * COUNT, 0, COUNT]

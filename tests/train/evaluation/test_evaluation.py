@@ -272,6 +272,16 @@ def test_unavailable_metrics_are_null_with_a_reason(run: Path, monkeypatch: pyte
     assert "flip-evaluator isn't installed" in table
 
 
+def test_a_library_that_fails_on_import_costs_its_metric_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As torchvision built for another version of torch does."""
+
+    def fail(name: str) -> types.ModuleType:
+        raise RuntimeError("operator torchvision::nms does not exist")
+
+    monkeypatch.setattr("msdgs_train.evaluation.perceptual.importlib.import_module", fail)
+    assert "torchvision can't be used: operator" in perceptual_metrics().unavailable["lpips"]
+
+
 def test_lpips_needs_its_weights_on_disk_and_images_in_plus_minus_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
