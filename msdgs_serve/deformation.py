@@ -124,8 +124,12 @@ class DeformationSession:
         if ids is not None and not len(ids):
             return {name: np.empty((0, *row), np.float32) for name, row in self._posed.items()}
         rows = slice(self.scene.moving_count) if ids is None else ids
-        outputs = zip(self._posed, self._run(t, np.arange(0), steps), strict=True)
-        return {name: output[rows] for name, output in outputs}
+        outputs = dict(zip(self._posed, self._run(t, np.arange(0), steps), strict=True))
+        for name, output in outputs.items():
+            count, row = self.scene.moving_count, self._posed[name]
+            if output.shape[1:] != tuple(row) or len(output) < count:
+                raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {(count, *row)}")
+        return {name: output[rows] for name, output in outputs.items()}
 
     def _checked_time(self, t: float) -> float:
         t0, t1 = self.scene.metadata.time_range

@@ -30,6 +30,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
 from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, random_model
@@ -195,6 +196,23 @@ def test_a_time_range_of_one_time(tmp_path: Path):
     baked = bake(model, replace(SCENE, time_range=(0.25, 0.25)), "0" * 64)
     session = opened(tmp_path / "scene.onnx", build("compact:50", baked))
     assert verify(session, model, times=3)["position"] < tolerance("compact.pose")
+
+
+@pytest.mark.parametrize(("plan", "row"), [("network", "export.relative"), ("compact:90", "compact.pose")])
+@pytest.mark.parametrize("kind", ["plane", "splines on nodes"])
+def test_times_that_do_not_begin_at_0(tmp_path: Path, kind: str, plan: str, row: str):
+    """The motion is that of the same layers from 0 to 1."""
+    some, ends = random_model(60, **FORMATS[kind] | {"noise": 0.2}), (2.0, 4.5)
+    later = DynamicGaussians(some.config, some.gaussians, SceneBounds(1.0, ends))
+    of_time = {name: values for name, values in later.named_buffers() if "time" in name}
+    later.load_state_dict(some.state_dict() | of_time)
+    first, second = (
+        opened(tmp_path / f"{number}.onnx", build(plan, bake(model, replace(SCENE, time_range=times), "0" * 64)))
+        for number, (model, times) in enumerate(((some, (0.0, 1.0)), (later, ends)))
+    )
+    poses = [(first.pose(part)[0], second.pose(2.0 + 2.5 * part)[0]) for part in (0.0, 0.44, 1.0)]
+    assert np.abs(poses[1][0] - poses[0][0]).max() > 2 * tolerance(row)
+    assert all(np.abs(a - b).max() <= tolerance(row) for a, b in poses)
 
 
 class RigidConfig(SupportConfig):

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 import msdgs_serve.rasterizer
-from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions
+from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, compositing_backward
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_train.rendering.rasterize import rasterize
 from tests.support import reference, reference_torch
-from tests.support.scenes import ADVERSARIAL, as_dtype, front_camera, gaussians_of, random_scene, select
+from tests.support.scenes import ADVERSARIAL, OPTIONS, as_dtype, front_camera, gaussians_of, random_scene, select
 from tests.support.tolerances import assert_close, tolerance
 
 BACKGROUND = (0.2, 0.6, 0.9)
@@ -160,7 +160,7 @@ def assert_as_autograd(
 
 
 @pytest.mark.parametrize("name", ["random", *sorted(set(ADVERSARIAL) - {"crowd"})])
-@pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 def test_autograd_through_a_plain_renderer(name: str, options: RasterizerOptions):
     gaussians, camera = random_scene(53, 60) if name == "random" else ADVERSARIAL[name]()
     gaussians = as_dtype(select(gaussians, slice(60)), np.float64)
@@ -255,6 +255,25 @@ def test_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
         grads = gradients(draw(parameters, camera), loss, parameters)
         results.append([grads[kind].tobytes() for kind in KINDS])
     assert all(result == results[0] for result in results[1:])
+
+
+@pytest.mark.parametrize("pairs", [1, 50])
+def test_in_rounds_the_gradient_is_the_same(monkeypatch: pytest.MonkeyPatch, pairs: int):
+    """As in large images, whose sums of all pairs would take too much memory."""
+    gaussians, camera = random_scene(58, 200, 90, 70)
+    loss, parameters = weighted(np.ones((70, 90))), parameters_of(gaussians, torch.float32)
+    at_once = gradients(draw(parameters, camera), loss, parameters)
+    counts, rounds_of = list[int](), compositing_backward._rounds
+
+    def counted(offsets: np.ndarray) -> list[tuple[int, int]]:
+        counts.append(len(rounds_of(offsets)))
+        return rounds_of(offsets)
+
+    monkeypatch.setattr(compositing_backward, "PAIRS_PER_ROUND", pairs)
+    monkeypatch.setattr(compositing_backward, "_rounds", counted)
+    in_rounds = gradients(draw(parameters, camera), loss, parameters)
+    assert counts[0] > 5
+    assert all(np.array_equal(in_rounds[kind], at_once[kind]) for kind in KINDS)
 
 
 @pytest.mark.parametrize("changed", ["image", "means"])

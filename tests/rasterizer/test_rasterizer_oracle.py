@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering, rasterize
+from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, Rendering, rasterize
 from msdgs_serve.rasterizer.counts import count_splats
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.splats import LOG2_OPACITY, ROOT_A, ROOT_B, ROOT_C, X, Y
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from tests.support.reference import DEPTH_BAND, Reference, render
-from tests.support.scenes import ADVERSARIAL, as_dtype, draw, front_camera, gaussians_of, random_scene
+from tests.support.scenes import ADVERSARIAL, OPTIONS, as_dtype, draw, front_camera, gaussians_of, random_scene
 from tests.support.tolerances import tolerance
 
 MANY = "ten_thousand_on_a_pixel"
@@ -98,7 +98,7 @@ def test_largest_image():
     assert not got.alpha[:1000, :1000].any()
 
 
-@pytest.mark.parametrize("options", [GSPLAT, INRIA], ids=["gsplat", "inria"])
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
 @pytest.mark.parametrize("name", ["random", *NAMES])
 def test_float64_agrees_to_rounding(name: str, options: RasterizerOptions):
     gaussians, camera = random_scene(8, 200) if name == "random" else ADVERSARIAL[name]()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numba.core.dispatcher import Dispatcher
 
-from msdgs_serve.rasterizer import Rendering
+from msdgs_serve.rasterizer import Rendering, tiles
 from msdgs_serve.scene import Gaussians
 from tests.support.processes import run_python
 from tests.support.scenes import FIELDS, as_dtype, draw, random_scene
@@ -44,6 +44,25 @@ def test_same_bytes_for_any_number_of_threads(threads: str, monkeypatch: pytest.
     expected = bytes_of(draw(gaussians, camera))
     monkeypatch.setenv("MSDGS_THREADS", threads)
     assert bytes_of(draw(gaussians, camera)) == expected
+
+
+@pytest.mark.parametrize("threads", ["1", "2", "3", "7"])
+def test_sorted_in_parts_the_lists_are_the_same(threads: str, monkeypatch: pytest.MonkeyPatch):
+    """As for many splats, on which several threads work."""
+    gaussians, camera = random_scene(41, 500, 150, 90)
+    expected = bytes_of(draw(gaussians, camera))
+    sizes: list[int] = []
+    parts_of = tiles._parts
+
+    def counted(count: int) -> list[tuple[int, int]]:
+        sizes.append(len(parts_of(count)))
+        return parts_of(count)
+
+    monkeypatch.setattr(tiles, "SPLATS_PER_PART", 50)
+    monkeypatch.setattr(tiles, "_parts", counted)
+    monkeypatch.setenv("MSDGS_THREADS", threads)
+    assert bytes_of(draw(gaussians, camera)) == expected
+    assert max(sizes) == int(threads)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from msdgs_serve.api.body_limit import BodyLimit
-from msdgs_serve.api.keys import SCOPES, KeyCheck, read_keys, scope_of
+from msdgs_serve.api.keys import SCOPES, KeyCheck, read_keys
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.scene import InvalidInput
 from tests.support.scene_files import write_scene
@@ -19,6 +19,21 @@ from tests.support.service import FRAME, check_problem, serving
 KEYS = {scope: f"{scope}-0123456789abcdef" for scope in SCOPES}
 # one call for each scope that has no effect if it is permitted
 CALLS = [("POST", "/render", "read"), ("DELETE", "/scenes/nothing", "write"), ("GET", "/metrics", "operate")]
+SCOPE_OF_CALL = {
+    ("GET", "/render"): "read",
+    ("POST", "/render"): "read",
+    ("POST", "/render/batch"): "read",
+    ("POST", "/render/video"): "read",
+    ("GET", "/scenes"): "read",
+    ("GET", "/scenes/{name}"): "read",
+    ("GET", "/scenes/{name}/file"): "read",
+    ("GET", "/scenes/{name}/report"): "read",
+    ("POST", "/scenes"): "write",
+    ("DELETE", "/scenes/{name}"): "write",
+    ("GET", "/metrics"): "operate",
+    ("GET", "/live"): None,
+    ("GET", "/ready"): None,
+}
 
 
 @pytest.fixture(scope="module")
@@ -97,13 +112,20 @@ def test_uploads_need_the_scope_write(client: httpx.Client, file: bytes):
         assert client.delete("/scenes/walk", headers={"X-API-Key": KEYS[scope]}).status_code == status
 
 
-def test_every_call_of_the_document_names_its_scope(client: httpx.Client):
+def test_every_call_of_the_document_needs_its_scope(client: httpx.Client):
     document = client.get("/openapi.json", headers={"X-API-Key": KEYS["read"]}).json()
-    for path, calls in document["paths"].items():
-        for method, call in calls.items():
-            scope = scope_of(method.upper(), path)
-            assert list(call.get("security", ())) == ([] if scope is None else [{"bearer": [scope]}, {"key": [scope]}])
-            assert scope is None or {"401", "403"} <= call["responses"].keys()
+    described = {
+        (method.upper(), path): call for path, calls in document["paths"].items() for method, call in calls.items()
+    }
+    assert described.keys() == SCOPE_OF_CALL.keys()
+    for (method, path), scope in SCOPE_OF_CALL.items():
+        call = described[method, path]
+        assert list(call.get("security", ())) == ([] if scope is None else [{"bearer": [scope]}, {"key": [scope]}])
+        assert scope is None or {"401", "403"} <= call["responses"].keys()
+        for owned, key in KEYS.items():
+            response = client.request(method, path.replace("{name}", "nothing"), headers={"X-API-Key": key})
+            assert (response.status_code == 403) == (scope not in (None, owned)), (method, path, owned)
+            assert response.status_code != 401
 
 
 def test_a_key_may_have_several_scopes(tmp_path: Path):

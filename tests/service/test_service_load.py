@@ -109,6 +109,43 @@ def test_requests_beyond_the_queue_are_rejected_with_retry_after(scene: Path, po
         assert client.post("/render", json=FRAME).status_code == 200
 
 
+def test_addresses_count_only_from_a_trusted_proxy(scene: Path, poses: SlowPoses):
+    settings: dict[str, Any] = {"concurrent_renders": 1, "queued_renders": 3, "proxies": "10.9.9.9"}
+    with serving_slowly(scene, poses, **settings) as (client, server), ThreadPoolExecutor(2) as pool:
+        queue = server.service.queue
+
+        def ask(number: int) -> httpx.Response:
+            return client.post("/render", json=FRAME, headers={"X-Forwarded-For": f"10.0.0.{number}"})
+
+        accepted = [pool.submit(ask, number) for number in (1, 2)]
+        eventually(lambda: (queue.running, queue.waiting) == (1, 1))
+        refused = ask(3)
+        check_problem(refused, 503)
+        assert "2 places" in refused.json()["detail"], "all of them are one client"
+        poses.go_on.set()
+        assert [future.result(MAX_SECONDS).status_code for future in accepted] == [200] * 2
+
+
+def test_with_keys_shares_are_by_key(scene: Path, poses: SlowPoses, tmp_path: Path):
+    keys = ["first-0123456789", "second-0123456789"]
+    (tmp_path / "keys").write_text("".join(f"read {key}\n" for key in keys))
+    settings: dict[str, Any] = {"concurrent_renders": 1, "queued_renders": 3, "api_keys_file": tmp_path / "keys"}
+    with serving_slowly(scene, poses, **settings) as (client, server), ThreadPoolExecutor(4) as pool:
+        queue = server.service.queue
+
+        def ask(key: str) -> httpx.Response:
+            return client.post("/render", json=FRAME, headers={"X-API-Key": key})
+
+        accepted = [pool.submit(ask, keys[0]) for _ in range(2)]
+        eventually(lambda: (queue.running, queue.waiting) == (1, 1))
+        check_problem(ask(keys[0]), 503)
+        accepted.append(pool.submit(ask, keys[1]))
+        eventually(lambda: (queue.running, queue.waiting) == (1, 2))
+        check_problem(client.post("/render", json=FRAME), 401)
+        poses.go_on.set()
+        assert [future.result(MAX_SECONDS).status_code for future in accepted] == [200] * 3
+
+
 def test_a_frame_that_takes_too_long_is_answered_in_time(scene: Path, poses: SlowPoses):
     with serving_slowly(scene, poses, render_seconds=0.3, concurrent_renders=1) as (client, server):
         started = time.monotonic()

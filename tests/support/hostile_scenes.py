@@ -160,6 +160,23 @@ vast = Add(row_now, column)
 few = Gather(vast, first)
 largest = Gather <axis = 1> (few, first)
 """
+SQUEEZING = """
+stacked = Mul(rows, t)
+row_now = Squeeze(stacked, none)
+vast = Add(row_now, column)
+few = Gather(vast, first)
+largest = Gather <axis = 1> (few, first)
+"""
+REDUCING = """
+stacked = Mul(rows, t)
+product = ReduceProd <keepdims = 0> (stacked, none)
+largest = Reshape(product, one_number)
+"""
+SCATTERING = """
+before = Reshape(t, one_row)
+after = ScatterND(before, rows, updates)
+largest = Reshape(after, one_number)
+"""
 PRODUCTS = f"""
 m0 = Mul(square, t)
 {" ".join(f"m{i + 1} = MatMul(m{i}, square)" for i in range(60))}
@@ -181,6 +198,34 @@ ATTACKS = (
         "six gigabytes by broadcasting",
         "`vast` (Add) brings a frame to 6,104 MiB of values; the limit is 2,048 MiB",
         beside_the_scene(BROADCASTING, row=np.ones((1, 40_000), np.float32), column=np.ones((40_000, 1), np.float32)),
+    ),
+    Attack(
+        "six gigabytes by a squeeze of no axes, which is of all",
+        "squeezes axes []",
+        beside_the_scene(
+            SQUEEZING,
+            rows=np.ones((1, 40_000, 1), np.float32),
+            column=np.ones((40_000, 1), np.float32),
+            none=np.empty(0, np.int64),
+        ),
+    ),
+    Attack(
+        "a reduction of no axes, which is of all",
+        "reduces no axes",
+        beside_the_scene(
+            REDUCING, rows=np.ones((1, 8), np.float32), none=np.empty(0, np.int64), one_number=np.ones(1, np.int64)
+        ),
+    ),
+    Attack(
+        "one row replaced a million times",
+        "replaces 1000000 rows of 1",
+        beside_the_scene(
+            SCATTERING,
+            rows=np.zeros((1_000_000, 1), np.int64),
+            updates=np.ones((1_000_000, 1), np.float32),
+            one_row=np.ones(2, np.int64),
+            one_number=np.ones(1, np.int64),
+        ),
     ),
     Attack(
         "a quadrillion operations",

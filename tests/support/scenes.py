@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.rasterizer import GSPLAT, INRIA, rasterize
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.camera import look_at
 
@@ -13,6 +13,14 @@ Scene = tuple[Gaussians, Camera]
 
 draw = functools.partial(rasterize, depth=True)
 """The channels that are drawn by default."""
+
+OPTIONS = {
+    "gsplat": GSPLAT,
+    "inria": INRIA,
+    "sharp": GSPLAT._replace(eps2d=0.15),
+    "others": GSPLAT._replace(eps2d=1.5, alpha_min=0.01, transmittance_min=0.01),
+}
+"""Options of the rasterizer by name."""
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh")
 IDENTITY_ROTATION = (1.0, 0.0, 0.0, 0.0)

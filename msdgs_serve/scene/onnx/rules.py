@@ -91,6 +91,8 @@ def scatter(call: Call) -> Result:
     rows = call.constant(1)
     if len(indices) != 2 or indices[1] != ONE or not data or updates != (indices[0], *data[1:]) or data[0].per_id:
         raise ShapeInvalid(f"replaces rows {text(indices)} of {text(data)} by {text(updates)}")
+    if rows.size > data[0].fixed:
+        raise ShapeInvalid(f"replaces {rows.size} rows of {data[0]}")
     if rows.size and not (rows.min() >= 0 and rows.max() < data[0].fixed):
         raise ShapeInvalid(f"replaces rows {rows.min()} to {rows.max()} of {data[0]}")
     return Result([data])
@@ -140,7 +142,7 @@ def squeeze(call: Call) -> Result:
     """Return the shape without some axes of length 1."""
     shape = call.shapes[0]
     gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
-    if any(shape[axis] != ONE for axis in gone):
+    if not gone or any(shape[axis] != ONE for axis in gone):  # no axes would mean all of length 1
         raise ShapeInvalid(f"squeezes axes {sorted(gone)} of {text(shape)}")
     return Result([tuple(dim for i, dim in enumerate(shape) if i not in gone)])
 
@@ -149,6 +151,8 @@ def reduce(call: Call) -> Result:
     """Return the shape of a reduction along some axes."""
     shape, keep = call.shapes[0], call.attribute("keepdims", 1)
     gone = axes_of(numbers(call.constant(1), "axes"), len(shape))
+    if not gone:
+        raise ShapeInvalid(f"reduces no axes of {text(shape)}")  # which would mean all
     left = tuple(ONE if i in gone else dim for i, dim in enumerate(shape) if keep or i not in gone)
     return Result([left], inner=tuple(shape[axis] for axis in gone))
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.datasets import load_scene
 from msdgs_train.density import config as density_module
 from msdgs_train.density.gradient import GradientStrategy
+from msdgs_train.engine import schedule as schedule_module
 from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.gradients import average_gradients
@@ -82,13 +84,33 @@ RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "mixed on nodes": ({"model": MODELS["mixed on nodes"], "batch_size": 2}, (8, 13)),
     "mixed on gaussians": ({"model": MODELS["mixed on gaussians"]}, (13,)),
     "mcmc": ({"density_strategy": "mcmc"}, (11,)),
+    "default": (
+        {
+            "model": dataclasses.replace(MODELS["mixed on nodes"], eps2d=0.15),
+            "batch_size": 2,
+            "threads": 2,
+            "half_resolution_fraction": 0.5,
+            "static_window_fraction": 0.1,
+            "init_min_views": 0.5,
+            "alpha_weight": 0.2,
+            "opacity_reg": 0.01,
+            "mse_fraction": 0.8,
+            "eps2d_init": 0.3,
+            "ema_fraction": 0.1,
+        },
+        (5, 7, 9, 14),
+    ),
 }
+"""Settings and steps to stop after."""
 
 
 @pytest.mark.usefixtures("no_curve")
 @pytest.mark.parametrize(("changes", "stops"), RESUMED.values(), ids=RESUMED)
-def test_resuming_changes_no_bit(data: Path, tmp_path: Path, changes: dict[str, Any], stops: tuple[int, ...]) -> None:
+def test_resuming_changes_no_bit(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], stops: tuple[int, ...]
+) -> None:
     """Stopped in the middle of a pass over the images."""
+    monkeypatch.setattr(schedule_module, "HALVED_WIDTH", SIZE)
     config = small_config(**changes)
     fit(config, data, tmp_path / "whole")
     whole = state_of(tmp_path / "whole")
@@ -153,10 +175,17 @@ def test_a_run_is_saved_before_its_last_evaluation(data: Path, tmp_path: Path, m
     assert (saved.step, saved.scene.llffhold) == (2, 3)
 
 
-def test_a_loss_that_is_not_finite_is_skipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "loss",
+    [lambda rgb: rgb.sum() * float("nan"), lambda rgb: rgb.sum() + (rgb - rgb.detach()).sum().sqrt()],
+    ids=["loss", "gradient"],
+)
+def test_a_loss_or_gradient_that_is_not_finite_is_skipped(
+    data: Path, monkeypatch: pytest.MonkeyPatch, loss: Callable[[torch.Tensor], torch.Tensor]
+) -> None:
     trainer = trained(small_config(steps=100, refine_every_fraction=0.0), load_scene(data), 1)
     before = [p.detach().clone() for p in splatting(trainer).model.parameters()]
-    monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: rgb.sum() * float("nan"))
+    monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, *others: loss(rgb))
     result = trainer.step()
     assert (result.step, result.skipped) == (2, 1)
     assert all(torch.equal(a, b) for a, b in zip(before, splatting(trainer).model.parameters(), strict=True))
