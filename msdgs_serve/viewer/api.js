@@ -48,7 +48,16 @@ export async function call(path, { headers = {}, ...options } = {}) {
 
 export const scenePath = (name) => `scenes/${encodeURIComponent(name)}`;
 
-export const getJson = async (path, options) => (await call(path, options)).json();
+/** Return a response's body, read by `blob()` or `json()`. Throws `Unreachable` if the connection breaks. */
+export async function received(body) {
+  try {
+    return await body;
+  } catch (error) {
+    throw error instanceof TypeError ? new Unreachable() : error;
+  }
+}
+
+export const getJson = async (path, options) => received((await call(path, options)).json());
 
 /** POST /render. */
 export function render(body, { signal, etag } = {}) {

@@ -1,7 +1,7 @@
 // Requests frames one at a time: small ones during motion, a full one after it.
 // A full frame in progress is aborted when something moves, and the service cancels its render.
 
-import { Refusal, render } from "./api.js";
+import { Refusal, received, render } from "./api.js";
 
 const FULL_AFTER = 150; // milliseconds
 const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
@@ -88,7 +88,7 @@ export class Frames {
 
   async #show(response, size, full, isNews) {
     const { pixels, asked, abort } = this.inFlight;
-    const bitmap = await createImageBitmap(await response.blob());
+    const bitmap = await createImageBitmap(await received(response.blob()));
     if (abort.signal.aborted) return;
     await new Promise(requestAnimationFrame);
     const seconds = (performance.now() - asked) / 1000;

@@ -203,8 +203,8 @@ async function isReplaced() {
 }
 
 async function start() {
+  const look = fromHash(location.hash); // a frame that arrives meanwhile replaces it
   await scenes.refresh();
-  const look = fromHash(location.hash);
   const name = scenes.names.includes(look.scene) ? look.scene : scenes.names[0];
   if (name === undefined) connection.say("No scenes. Files that are added to the service’s folder appear here.");
   else await open(name, look);

@@ -319,6 +319,36 @@ def test_it_reports_an_unavailable_service_and_recovers(page: Page, scenes: Path
         assert not page.locator("#banner").is_visible()
 
 
+def test_a_frame_whose_connection_breaks_is_asked_for_again(page: Page, client: httpx.Client):
+    page.add_init_script("""
+        const whole = Response.prototype.blob;
+        Response.prototype.blob = function () {
+            const breaks = window.breaks;
+            window.breaks = false;
+            return breaks ? Promise.reject(new TypeError("network error")) : whole.call(this);
+        };
+    """)
+    open_page(page, client)
+    page.evaluate("window.breaks = true")
+    page.locator("#image").focus()
+    page.keyboard.press("ArrowLeft")
+    page.get_by_text("The service doesn’t answer").wait_for()
+    forget(page)
+    wait_until_still(page)
+    assert not page.locator("#banner").is_visible()
+
+
+def test_an_address_that_is_entered_while_scenes_are_listed_is_shown(opened: Page):
+    held: list[Route] = []
+    opened.route("**/scenes", lambda route: held.append(route))
+    with opened.expect_request("**/scenes"):
+        opened.evaluate("location.hash = '#scene=balls&t=0.25&at=10,30,4,0,0,0.5'")
+    opened.evaluate("history.replaceState(null, '', '#scene=balls&t=0.75&at=10,30,4,0,0,0.5')")  # as a frame does
+    held[0].continue_()
+    opened.unroute("**/scenes")
+    opened.get_by_text("t 0.250").wait_for()
+
+
 def test_a_key_is_asked_for_and_kept_for_the_tab(page: Page, scenes: Path, tmp_path: Path):
     (tmp_path / "keys").write_text(f"read {KEY}")
     with serving(scenes, api_keys_file=tmp_path / "keys") as client:
