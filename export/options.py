@@ -134,6 +134,8 @@ class ConvertOptions:
 
 
 def require_folder_of(field: str, file: Path | None) -> None:
-    """Raise `InvalidInput` naming `field` if the folder in which a file is to be written doesn't exist."""
+    """Raise `InvalidInput` naming `field` if a file can't be written there: its folder doesn't exist, or it is one."""
     if file is not None and not file.parent.is_dir():
         raise InvalidInput(field, "in a folder that exists", str(file))
+    if file is not None and file.is_dir():
+        raise InvalidInput(field, "a file, not a folder", str(file))

@@ -48,7 +48,7 @@ def convert(options: ConvertOptions, console: Console) -> None:
     out = options.out
     if out.suffix in VIDEOS:
         raise InvalidInput("out", f"other than a video: msdgs-render {options.scene} {out} writes one", out.name)
-    if out.suffix:
+    if out.suffix in (*SINGLE, *USD, ONNX):
         require_folder_of("out", out)
     if out.suffix == ONNX and options.t is not None:
         raise InvalidInput("t", "left out for a file that holds all times", options.t)

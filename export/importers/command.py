@@ -15,7 +15,7 @@ from export.importers.sequence import posed, read_sequence, sequence_scene, show
 from export.importers.splats.formats import READERS, read_splats
 from export.importers.splats.sog import META
 from export.measure.stability import MIN_PSNR
-from export.options import ExportOptions
+from export.options import ExportOptions, require_folder_of
 from export.progress import tracked
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
@@ -35,6 +35,7 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
     if file_format == "detect":
         file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
     file_format = checked_format(file_format)
+    require_folder_of("output", output)
     if file_format == "model":
         yield path / "model.pt" if path.is_dir() else path
     elif file_format in RUNS:
@@ -47,8 +48,6 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
             if lost:
                 note_left_out(output, lost)
     else:
-        if not output.parent.is_dir():
-            raise InvalidInput("output", "in a folder that exists", str(output))
         for field in fields(options):
             if field.name not in FOR_SPLATS and getattr(options, field.name) != field.default:
                 raise InvalidInput(field.name, "left out: it is for trained models", str(getattr(options, field.name)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,11 +14,11 @@ from rich.table import Column, Table
 
 from export.jobs.job import Candidate, ExportJob, TargetNotReached
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
-from export.jobs.store import METADATA_BYTES, PLAN_PART, check_min_psnr, squared, stored, within_bytes
+from export.jobs.store import METADATA_BYTES, PLAN_PART, UNUSABLE, check_min_psnr, squared, stored, within_bytes
 from export.jobs.sweep import Sweep, as_stored, pruning_levels
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
-from export.options import ExportOptions, require_folder_of
+from export.options import ExportOptions
 from export.plans.registry import parse
 from export.progress import Track, tracked
 from export.pruning import RULES
@@ -91,7 +92,6 @@ def _check(options: ExportOptions) -> None:
         raise InvalidInput("times", "2 or more", options.times)
     if options.chosen_plan is not None:
         parse(options.chosen_plan)
-    require_folder_of("output", options.scene_file)
 
 
 def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutImages | None:
@@ -113,10 +113,11 @@ def _planned(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
     if job.rules:
         budget = (PLAN_PART if job.packs else 1.0) * (squared(job.min_psnr) - squared(best.psnr_worst))
         for fraction in (1.0, 0.5, 0.25) if budget > 0 else ():
-            pruned = job.candidate(plan, -10 * math.log10(fraction * budget))
-            error = job.error(pruned)
-            if squared(error.psnr_worst) <= squared(best.psnr_worst) + budget:
-                return pruned, error
+            with suppress(*UNUSABLE):  # then less is removed
+                pruned = job.candidate(plan, -10 * math.log10(fraction * budget))
+                error = job.error(pruned)
+                if squared(error.psnr_worst) <= squared(best.psnr_worst) + budget:
+                    return pruned, error
     return whole, best
 
 
@@ -127,7 +128,10 @@ def _planned_within_bytes(job: ExportJob, plan: str) -> tuple[Candidate, Rendere
     whole, required = job.candidate(plan, None), job.required_psnr
     if required is None and whole.size + METADATA_BYTES <= job.max_bytes:
         return whole, job.error(whole)
-    candidates = [whole, *(job.candidate(plan, level) for level in (pruning_levels(job) if job.rules else ()))]
+    candidates = [whole]
+    for level in pruning_levels(job) if job.rules else ():
+        with suppress(*UNUSABLE):
+            candidates.append(job.candidate(plan, level))
     different = {candidate.digest: candidate for candidate in candidates}.values()
     fitting = within_bytes(job, list(different), [])
     best, error = max(fitting, key=lambda each: each[1].psnr_worst)

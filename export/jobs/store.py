@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
 import onnx
@@ -31,6 +32,7 @@ METADATA_BYTES = 3000
 UNUSABLE = (InvalidInput, SceneFileInvalid)
 """Errors of a file whose poses can't be drawn: rounded to fewer bits, or overflowing in float32."""
 
+Measured = TypeVar("Measured")
 Measure = Callable[[onnx.ModelProto, int], RenderedError]
 """The error of a scene file's frames: of all, or of every n-th."""
 
@@ -90,9 +92,9 @@ def within_bytes(
 
 def usable(
     candidates: Iterable[Candidate],
-    measure: Callable[[Candidate], tuple[Candidate, RenderedError]],
+    measure: Callable[[Candidate], tuple[Candidate, Measured]],
     refused: list[tuple[str, str]],
-) -> Iterator[tuple[Candidate, RenderedError]]:
+) -> Iterator[tuple[Candidate, Measured]]:
     """What `measure` returns for each candidate; those that can't be drawn are added to `refused`, by plan and why.
 
     Raises `InvalidInput` if no other is left.

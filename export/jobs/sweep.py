@@ -271,15 +271,21 @@ class Sweep:
 
         return [e for e in self.estimates if e.worst_db >= MIN_USEFUL_DB and not dominated(e)]
 
+    def ahead(self) -> list[QuickEstimate]:
+        """The candidates that aren't dominated, as many as are measured in full: the fastest that may be chosen, then
+        the fastest of the others; or if speed doesn't count, those with the smallest error."""
+        ahead, least = self._undominated(), self.min_psnr
+        if self.max_bytes is not None:
+            ahead = [e for e in ahead if e.size <= self.max_bytes] or [min(self.estimates, key=lambda e: e.size)]
+        if least is None:
+            return heapq.nlargest(MAX_POINTS, ahead, key=lambda e: e.worst_db)
+        # the worst of all frames is no better than the worst of some
+        return heapq.nsmallest(MAX_POINTS, ahead, key=lambda e: (e.worst_db < least, e.cpu))
+
     def _measured(self) -> SweepResult:
         if not self.estimates:
             raise nothing_left(self.refused)
-        ahead = sorted(self._undominated(), key=lambda estimate: estimate.cpu)
-        if self.max_bytes is not None:
-            ahead = [e for e in ahead if e.size <= self.max_bytes] or [min(self.estimates, key=lambda e: e.size)]
-        if self.min_psnr is None:  # speed doesn't count
-            ahead = heapq.nlargest(MAX_POINTS, ahead, key=lambda e: e.worst_db)
-        ahead = ahead[:MAX_POINTS]
+        ahead = self.ahead()
         ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
         candidates = [estimate.candidate for estimate in ahead]
         if self.max_bytes is None:
@@ -304,13 +310,14 @@ class Sweep:
         return best if leaves is None or points[leaves].milliseconds > TIME_MARGIN * fastest else leaves
 
     def _points(self, measured: list[tuple[Candidate, RenderedError]]) -> list[Point]:
-        """Points of candidates and their errors."""
-        candidates = [candidate for candidate, _ in measured]
-        images = [_images_psnr(self.job, candidate) for candidate in candidates]
+        """Points of candidates and their errors, but for those that can't be drawn at a held-out image's time."""
+        errors, job = dict(measured), self.job
+        images = dict(usable(errors, lambda candidate: (candidate, _images_psnr(job, candidate)), self.refused))
+        candidates = list(images)
         times = time_frames(candidates, self._timed, self.job.info.background, self.job.progress)
         memory = _memory(self.job, candidates)
-        parts = zip(measured, times, memory, images, strict=True)
-        return [Point(c, time, error, bytes_, psnr) for (c, error), time, bytes_, psnr in parts]
+        parts = zip(candidates, times, memory, strict=True)
+        return [Point(c, time, errors[c], bytes_, images[c]) for c, time, bytes_ in parts]
 
     def _tracked(self, candidates: list[Candidate]) -> Iterator[Candidate]:
         on_error = self.job.progress("all frames of the points", len(candidates))

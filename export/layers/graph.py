@@ -1,5 +1,6 @@
 """A small builder of ONNX graphs of named constants and nodes."""
 
+import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -9,9 +10,14 @@ import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
+from msdgs_serve.scene.errors import InvalidInput
+
 OPSET = 18
 IR_VERSION = 9
 """The version of opset 18, which every onnxruntime since 1.14 reads."""
+
+MAX_BYTES = (1 << 31) - (1 << 20)
+"""Of the arrays of a file, which holds 2 GiB at most, with nodes and metadata."""
 
 Parameter = torch.Tensor | torch.nn.Module  # torch types every attribute of a module as either
 
@@ -52,7 +58,14 @@ class GraphBuilder:
         opset: int = OPSET,
         ir_version: int = IR_VERSION,
     ) -> onnx.ModelProto:
-        """The checked model; inputs with type and shape, outputs with shape by name, float32 but for `types`."""
+        """The checked model; inputs with type and shape, outputs with shape by name, float32 but for `types`.
+
+        Raises `InvalidInput` if its constants don't fit into a file.
+        """
+        size = sum(math.prod(each.dims) * _itemsize(each) for each in self.constants.values())
+        if size > MAX_BYTES:
+            fits = "small enough for an ONNX file, which holds at most 2 GiB"
+            raise InvalidInput("model", fits, f"{size / 2**30:.2f} GiB of arrays")
         graph = helper.make_graph(
             self.nodes,
             name,
@@ -72,6 +85,10 @@ def affine(graph: GraphBuilder, name: str, value: str, weight: Parameter, bias: 
     """Rows times a Linear's weight, plus its bias."""
     constants = [graph.constant(f"{name}.{kind}", to_numpy(v)) for kind, v in (("weight", weight), ("bias", bias))]
     return graph.node("Gemm", [value, *constants], f"{name}.out", transB=1)
+
+
+def _itemsize(tensor: onnx.TensorProto) -> int:
+    return helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
 
 
 def to_numpy(tensor: Parameter) -> np.ndarray:

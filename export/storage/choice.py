@@ -50,7 +50,7 @@ GROUPS = {
         | {"rank 64": low_rank(64, fine=24)}
         | _bits(in_range, 16),
     ),
-    "planes": Group(r"layer\d+\.(space|time)", _bits(in_range, 8, 16)),
+    "planes": Group(r"layer\d+\.grid\d+\.(space|time)", _bits(in_range, 8, 16)),
     "functions of time": Group(r"functions\.control", _bits(in_range, 8, 16)),
     "leading coefficients": Group(r"coefficients\d+\.leading", _bits(in_range, 8, 16)),
     "coefficients": Group(r"coefficients\d+\.rest", _bits(in_range, 8, 16)),

@@ -11,16 +11,20 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from rich.console import Console
 
+from export.exporters.command import convert
+from export.importers.command import model_or_import
 from export.jobs.bake import bake, starting_cameras
 from export.layers.graph import GraphBuilder
 from export.measure.images import HeldOutImages
 from export.measure.verify import VerificationFailed, times_to_verify, verify
-from export.options import ExportOptions
+from export.options import ConvertOptions, ExportOptions
 from export.plans.registry import build
 from export.to_onnx import main as to_onnx
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -291,6 +295,37 @@ def test_the_scripts_run_from_any_folder_and_their_help_has_examples(tmp_path: P
 def test_no_module_shadows_another():
     names = {path.stem for path in (ROOT / "export").glob("*.py")}
     assert not names & ({"onnx", "onnxruntime", "torch", "numpy"} | sys.stdlib_module_names)
+
+
+def test_arrays_that_no_file_holds_are_refused_with_their_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("export.layers.graph.MAX_BYTES", 2**14)
+    for count, code in ((20, 0), (1000, 1)):
+        (tmp_path / "a.ply").write_bytes(ply_bytes(inria_columns(some_gaussians(count))))
+        assert to_onnx(ExportOptions(tmp_path / "a.ply", tmp_path / f"{count}.onnx")) == code
+    assert "an ONNX file, which holds at most 2 GiB, got 0.00 GiB of arrays" in capsys.readouterr().err
+    assert not (tmp_path / "1000.onnx").exists()
+
+
+def test_a_folder_is_no_output_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene_file: Path):
+    def work(*_: object, **__: object) -> None:
+        raise AssertionError("it is noticed too late")
+
+    for name in ("jobs.command.ExportJob", "importers.command.read_splats", "importers.command.write_model"):
+        monkeypatch.setattr(f"export.{name}", work)
+    for file_format in ("model", "ply", "deformgs"):
+        options = ExportOptions(scene_file.parent / "model.pt", tmp_path, format=file_format)
+        with (
+            pytest.raises(InvalidInput, match="`output` must be a file, not a folder"),
+            model_or_import(options, Console()),
+        ):
+            work()
+    monkeypatch.setattr("export.exporters.command.DeformationSession", work)
+    for suffix in (".ply", ".onnx", ".usdc"):
+        (tmp_path / f"out{suffix}").mkdir()
+        with pytest.raises(InvalidInput, match="`out` must be a file, not a folder"):
+            convert(ConvertOptions(scene_file, tmp_path / f"out{suffix}"), Console())
 
 
 def test_two_arrays_of_one_name_are_refused() -> None:

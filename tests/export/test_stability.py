@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -175,10 +176,15 @@ def test_the_command_flags_a_model_that_overflows(tmp_path: Path, capsys: pytest
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"times": 1}, "`times`"), ({"min_psnr": -1.0}, "`min_psnr`"), ({"min_psnr": float("nan")}, "`min_psnr`")],
+    [
+        ({"times": 1}, "`times`"),
+        ({"min_psnr": -1.0}, "`min_psnr`"),
+        ({"min_psnr": float("nan")}, "`min_psnr`"),
+        ({"json": Path()}, "`json` must be a file, not a folder"),
+    ],
 )
 def test_the_command_refuses_invalid_settings(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, float], message: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
 ):
     assert main(saved(tmp_path, random_model(5)), **settings) == 1  # type: ignore[arg-type]
     assert message in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """Arrays in fewer bits: each kind against float64, every plan, and files whose frames have the error that they say."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,16 @@ def test_every_plan_works_with_storage(tmp_path: Path, kind: str, plan: str):
     assert sizes == sorted(sizes, reverse=True)
     assert 0 < errors[0] < tolerance("int8.relative" if plan == "int8" else "stored_16bit")
     assert errors[1] < tolerance("int8.relative" if plan == "int8" else "stored_8bit")
+
+
+def test_each_group_has_arrays_of_some_scene():
+    frames = Frames((some_gaussians(20, 0), some_gaussians(21, 0)), 0, "dilate", blended=False)
+    models = {kind: bake(random_model(400, **settings), SCENE, "0" * 64) for kind, settings in MODELS.items()}
+    scenes = [sequence_scene(frames, "0" * 64), *(build("network", baked) for baked in models.values())]
+    scenes.append(build("compact:60", models["mlp"], Trajectories(models["mlp"], resolved=RESOLVED)))
+    names = {each.name for scene in scenes for each in scene.graph.initializer}
+    groups = {next(n for n, group in GROUPS.items() if re.fullmatch(group.names, name)) for name in names}
+    assert groups == set(GROUPS)
 
 
 def test_a_written_file_is_smaller_and_its_frames_have_the_error_that_it_says(tmp_path: Path):

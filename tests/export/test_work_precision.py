@@ -12,20 +12,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
+from export.jobs.job import ExportJob
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.jobs.store import within_bytes
-from export.jobs.sweep import TIME_MARGIN, Point, Sweep, SweepResult, choose, front
+from export.jobs.sweep import TIME_MARGIN, Point, QuickEstimate, Sweep, SweepResult, choose, front
 from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
 from export.measure.timing import FrameTime, Milliseconds
 from export.options import ExportOptions
-from export.plans.registry import PLANS
 from export.pruning import RULES
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
-from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 from tests.support.tolerances import tolerance
 
@@ -108,47 +105,19 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
     assert any(p.candidate.session.scene.moving_count <= OBJECT for p in within)
 
 
-@pytest.mark.parametrize("at", ["all times", "one that no estimate tries"])
-def test_plans_whose_motion_overflows_in_float32_are_refused_and_fitted_ones_are_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
-):
-    job, whole = new_job(tmp_path), DeformationSession.pose
-    views = job.exact.views
-    one = ({view.t for view in views} - {view.t for view in views[::ESTIMATE_STRIDE]}).pop()
-
-    def pose(session: DeformationSession, t: float, *args: Any, **kwargs: Any) -> Any:
-        if not session.scene.metadata.plan.startswith("compact") and (at == "all times" or t == one):
-            raise SceneFileInvalid("scene", "means", "overflow")
-        return whole(session, t, *args, **kwargs)
-
-    monkeypatch.setattr(DeformationSession, "pose", pose)
-    monkeypatch.setitem(PLANS, "compact", replace(PLANS["compact"], candidates=lambda layers: ["compact:70"]))
-    result = Sweep(job).run()
-    assert {plan for plan, why in result.refused if "overflow" in why} == {"network", "prefix:1"}
-    assert {point.candidate.plan for point in result.points} == {"compact:70"}
-
-
-def test_a_file_of_few_bytes_that_overflows_is_refused_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    measure, overflowing, refused = ExportJob.error, set[float | None](), list[tuple[str, str]]()
-
-    def error(job: ExportJob, candidate: Candidate, every: int = 1) -> RenderedError:
-        if every == 1 and candidate.pruning_db in overflowing:
-            raise SceneFileInvalid("scene", "means", "overflow")
-        return measure(job, candidate, every)
-
-    job = ExportJob(saved(tmp_path, moving_object()), tmp_path, max_bytes=10**6)
-    candidates = [job.candidate("network", level) for level in (None, 50.0)]
-    monkeypatch.setattr(ExportJob, "error", error)
-    overflowing.add(50.0)
-    assert [kept.pruning_db for kept, _ in within_bytes(job, candidates, refused)] == [None]
-    job.max_bytes = 1000
-    with pytest.raises(TargetNotReached, match="the smallest file tried"):
-        within_bytes(job, candidates, refused)
-    assert refused == [("network", "scene: `means` overflow")] * 2
-    overflowing.add(None)
-    for job.max_bytes in (1000, 10**6):
-        with pytest.raises(InvalidInput, match=r"one that some plan can hold, got .*overflow"):
-            within_bytes(job, candidates, refused)
+def test_what_cannot_be_chosen_is_measured_last(monkeypatch: pytest.MonkeyPatch):
+    """Of too many candidates, however fast it is."""
+    monkeypatch.setattr("export.jobs.sweep.MAX_POINTS", 3)
+    exact = SimpleNamespace(views=[None])
+    kept = []
+    for min_psnr in (50.0, None):
+        sweep = Sweep(cast(Any, SimpleNamespace(required_psnr=min_psnr, max_bytes=None, exact=exact)))
+        measured = ((1.0, 40.0), (2.0, 45.0), (3.0, 51.0), (4.0, 60.0), (5.0, 65.0), (6.0, 70.0))
+        sweep.estimates = [QuickEstimate(cast(Any, None), cpu, 0.0, db, 1) for cpu, db in measured]
+        kept.append([estimate.cpu for estimate in sweep.ahead()])
+        sweep.estimates = sweep.estimates[:3]
+        kept.append([estimate.cpu for estimate in sweep.ahead()])
+    assert kept == [[3, 4, 5], [3, 1, 2], [6, 5, 4], [3, 2, 1]]
 
 
 def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
