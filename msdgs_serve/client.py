@@ -126,7 +126,7 @@ class Frame:
     """A rendered frame as float32 arrays; channels that were not requested are None."""
 
     rgb: FloatArray | None  # [H, W, 3] sRGB-encoded; premultiplied by alpha if the background is transparent
-    alpha: FloatArray | None  # [H, W]
+    alpha: FloatArray | None  # [H, W] coverage by Gaussians, also where a background is behind them
     depth: FloatArray | None  # [H, W] along the camera's axis, scene units, infinite where nothing was drawn
     motion: FloatArray | None  # [H, W, 2] displacement until t + dt, pixels to the right and down
     gaussians: FloatArray | None  # [H, W] number of Gaussians that contribute to each pixel

@@ -14,6 +14,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
+from msdgs_serve.scene import InvalidInput
 from msdgs_serve.threads import THREADS_VARIABLE
 
 if TYPE_CHECKING:
@@ -25,13 +26,34 @@ MAX_REJECTIONS = 200
 
 
 def application(arguments: Mapping[str, str]) -> Any:
-    """Return a Ray Serve application. Raises pydantic's `ValidationError` naming the invalid argument."""
-    from msdgs_serve.api.settings import Settings
+    """Return a Ray Serve application. Raises `InvalidInput` or pydantic's `ValidationError` naming the invalid
+    argument."""
+    return deployment(*read_arguments(arguments))
+
+
+def read_arguments(arguments: Mapping[str, str]) -> tuple["Settings", int, int]:
+    """Return the settings, the number of replicas and the cores of each. Raises as `application`."""
+    from msdgs_serve.api.settings import Settings, split_list
 
     given = dict(arguments)
-    replicas, cores = int(given.pop("replicas", "1")), int(given.pop("cores", "1"))
-    values: dict[str, Any] = {**given, "scenes": given.get("scenes", "").split(os.pathsep), "threads": cores}
-    return deployment(Settings(**values), replicas, cores)
+    replicas, cores = (_count(name, given.pop(name, "1")) for name in ("replicas", "cores"))
+    for name in given.keys() - Settings.model_fields.keys():
+        raise InvalidInput(name, "left out, as there is no such setting", given[name])
+    lists = {name: split_list(name, given[name]) for name in ("scenes", "cors_origins") if name in given}
+    settings = Settings(**{**given, **lists, "threads": cores})
+    if not settings.scenes:
+        raise InvalidInput("scenes", "scene files or folders of them", "nothing")
+    return settings, replicas, cores
+
+
+def _count(name: str, text: str) -> int:
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if count < 1:
+        raise InvalidInput(name, "a whole number, 1 or more", text)
+    return count
 
 
 Message = Any

@@ -1,6 +1,7 @@
 """Scenes on disk: found by name, loaded at the first request, reloaded when their file changes."""
 
 import logging
+import math
 import os
 import sys
 import threading
@@ -11,11 +12,13 @@ from dataclasses import dataclass, field
 from dataclasses import replace as replaced
 from functools import cached_property
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.files import Signature, move, sync
+from msdgs_serve.files import signature as signature_of
 from msdgs_serve.framing import Framing, framing
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
 
@@ -26,17 +29,12 @@ INCOMING_SECONDS = 3600.0
 MAX_NAME_BYTES = 200
 """Limit in UTF-8, so that a name with prefix and suffix is a valid file name on any file system."""
 MAX_OPEN_ATTEMPTS = 5
+RETRY_SECONDS = 10.0
+"""Interval of attempts to load a file that failed for a cause outside of it."""
+TEMPORARY = (OSError, MemoryError)
+"""Errors that may not occur again, although the file doesn't change."""
 
 logger = logging.getLogger("msdgs_serve")
-
-
-class Signature(NamedTuple):
-    """What changes with the contents of a file."""
-
-    path: Path
-    modified: int  # ns
-    size: int  # bytes
-    inode: int
 
 
 class SceneExists(MsdgsError):
@@ -85,7 +83,7 @@ class SceneContents:
     @property
     def is_unchanged(self) -> bool:
         """Whether no program has written into the file since it was loaded."""
-        return _signature(self.signature.path, os.fstat(self.file.fileno())) == self.signature
+        return signature_of(self.signature.path, os.fstat(self.file.fileno())) == self.signature
 
 
 @dataclass(frozen=True)
@@ -103,13 +101,19 @@ class _Entry:
     tried: Signature | None = None
     served: ServedScene | None = None
     problem: SceneFileInvalid | None = None
+    retry_at: float = math.inf  # when the same file is tried again
+
+    def is_tried(self, signature: Signature) -> bool:
+        """Whether there is no reason to load the file of this signature now."""
+        return self.tried == signature and time.monotonic() < self.retry_at
 
 
 class SceneStore:
     """Scenes in files and folders, named by the files' stems. Safe to use from several threads.
 
     Folders are listed again by every call, so that files may be added, changed and removed. `refresh` reloads changed
-    files; meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports.
+    files; meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports. A
+    file that can't be read is tried again after a while.
 
     Scenes are added to and removed from `folder`, the first one among the paths, whose files never hide those of other
     paths.
@@ -195,7 +199,8 @@ class SceneStore:
         return None
 
     def refresh(self) -> None:
-        """Reload files that changed since the last attempt. Scenes that weren't requested are not loaded."""
+        """Reload files that changed since the last attempt or are due for another. Scenes that weren't requested are
+        not loaded."""
         for name, file in self._files().items():
             with self._lock:
                 entry = self._entries.get(name)
@@ -223,7 +228,7 @@ class SceneStore:
         target = self._writable_folder() / f"{name}{SUFFIX}"
         present = self._files().get(name, target)
         if present != target or (present.exists() and not replace):
-            raise SceneExists(f"the scene `{name}` exists already")
+            raise _exists(name)
         return target
 
     def add(self, name: str, incoming: Path, *, replace: bool = False) -> ServedScene:
@@ -237,14 +242,15 @@ class SceneStore:
         with self._writing:
             target = self.target(name, replace=replace)
             scene = self._open(incoming, name)
-            _sync(incoming)
             entry = self._entry(name)
             with entry.lock:
-                os.replace(incoming, target)
-                _sync(target.parent)
-                entry.tried = _signature(target, os.stat(target))
+                try:
+                    move(incoming, target, replace=replace)
+                except FileExistsError:  # another process was faster
+                    raise _exists(name) from None
+                entry.tried = signature_of(target)
                 entry.served = served = replaced(scene, signature=entry.tried)
-                entry.problem = None
+                entry.problem, entry.retry_at = None, math.inf
             self._make_room()
             return served
 
@@ -260,7 +266,7 @@ class SceneStore:
             if file != own and not own.exists():
                 raise InvalidInput("name", "that of a scene in the folder for uploads", name)
             own.unlink(missing_ok=True)
-            _sync(folder)
+            sync(folder)
 
     def _status(self, name: str) -> SceneStatus:
         with self._lock:
@@ -275,17 +281,17 @@ class SceneStore:
         return self.folder
 
     def _update(self, entry: _Entry, file: Path) -> ServedScene | None:
-        """Load `file` if it changed since the last attempt, and return the version that is served. Other threads wait
-        only if there is none."""
+        """Load `file` if it changed since the last attempt or is due for another, and return the version that is
+        served. Other threads wait only if there is none."""
         try:
-            signature = _signature(file, os.stat(file))
+            signature = signature_of(file)
         except FileNotFoundError:
             return entry.served
         served = entry.served
-        if (served and entry.tried == signature) or not entry.lock.acquire(blocking=served is None):
+        if (served and entry.is_tried(signature)) or not entry.lock.acquire(blocking=served is None):
             return served
         try:
-            if entry.tried != signature:
+            if not entry.is_tried(signature):
                 self._load(entry, file, signature)
             return entry.served
         finally:
@@ -305,12 +311,17 @@ class SceneStore:
                     entry.lock.release()
 
     def _load(self, entry: _Entry, file: Path, signature: Signature) -> None:
+        entry.retry_at = math.inf
         try:
             entry.served, entry.problem = self._open(file, file.stem), None
         except SceneFileInvalid as error:
             entry.problem = error.again()
-        except OSError as error:
-            entry.problem = SceneFileInvalid(file.name, "file", f"can't be read: {error.strerror}")
+            if isinstance(error.__cause__, TEMPORARY):
+                entry.retry_at = time.monotonic() + RETRY_SECONDS
+        except TEMPORARY as error:
+            reason = getattr(error, "strerror", None) or "memory is short"
+            entry.problem = SceneFileInvalid(file.name, "file", f"can't be read: {reason}")
+            entry.retry_at = time.monotonic() + RETRY_SECONDS
         except Exception as error:  # one file must not keep others from being served
             logger.exception("%s can't be opened", file)
             entry.problem = SceneFileInvalid(file.name, "file", f"can't be opened: {type(error).__name__}")
@@ -319,9 +330,9 @@ class SceneStore:
     def _open(self, file: Path, name: str) -> ServedScene:
         """Open the scene in a file, again if the file changes meanwhile."""
         for _ in range(MAX_OPEN_ATTEMPTS):
-            before = _signature(file, os.stat(file))
+            before = signature_of(file)
             session = self._open_scene(file)
-            if _signature(file, os.stat(file)) == before:
+            if signature_of(file) == before:
                 return ServedScene(name, session, before)
         raise SceneFileInvalid(file.name, "file", "changes while it is being read")
 
@@ -364,6 +375,10 @@ def is_servable_name(name: str) -> bool:
     return len(name.encode()) <= MAX_NAME_BYTES
 
 
+def _exists(name: str) -> SceneExists:
+    return SceneExists(f"the scene `{name}` exists already")
+
+
 def _checked(path: Path) -> Path:
     if path.is_dir():
         return path
@@ -375,16 +390,3 @@ def _checked(path: Path) -> Path:
     if not is_servable_name(path.stem):
         raise InvalidInput("paths", "files with printable, unhidden names", repr(path.name))
     return path
-
-
-def _signature(path: Path, status: os.stat_result) -> Signature:
-    return Signature(path, status.st_mtime_ns, status.st_size, status.st_ino)
-
-
-def _sync(path: Path) -> None:
-    """Flush a file or folder to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

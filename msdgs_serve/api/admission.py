@@ -18,8 +18,8 @@ Call = tuple[str, str]
 class Admission:
     """ASGI middleware that admits a request to the queue or rejects it, before its body is parsed and routed.
 
-    Under overload most of the work is rejecting requests. A request with `If-None-Match` takes a place in the queue
-    only once it has work.
+    Under overload most of the work is rejecting requests. A request for a single response with `If-None-Match` takes a
+    place in the queue only once it has work.
     """
 
     def __init__(
@@ -37,12 +37,11 @@ class Admission:
         if route is None:
             await self._app(scope, receive, send)
             return
-        at_once = not any(name == b"if-none-match" for name, _ in scope["headers"])
+        streamed = call in self._streamed
+        at_once = streamed or not any(name == b"if-none-match" for name, _ in scope["headers"])
         with ExitStack() as place:
             try:
-                place.enter_context(
-                    self._queue.admitted(client_of(scope), streamed=call in self._streamed, at_once=at_once)
-                )
+                place.enter_context(self._queue.admitted(client_of(scope), streamed=streamed, at_once=at_once))
             except RequestRejected as refused:
                 scope["route"], scope[KIND] = route, refused.kind
                 await rejection(refused)(scope, receive, send)

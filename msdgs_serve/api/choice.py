@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from msdgs_serve.scene import InvalidInput, SceneFileInvalid
+from msdgs_serve.scene import InvalidInput, SceneFileInvalid, SceneNotFound
 from msdgs_serve.scene.baked import SceneMetadata
 from msdgs_serve.scene_report import read_report
 from msdgs_serve.store import SceneStore, ServedScene
@@ -26,7 +26,7 @@ def fastest_within(store: SceneStore, scene: ServedScene, decibels: float) -> Se
         raise InvalidInput(FIELD, f"at most {best:.1f} dB, the highest of the files of `{scene.name}`", decibels)
     milliseconds = _reported_milliseconds(store, [each for each, _ in measured])
     unknown = float("inf")
-    return min(fitting, key=lambda each: (milliseconds.get(_key(each), unknown), store.file(each.name).stat().st_size))
+    return min(fitting, key=lambda each: (milliseconds.get(_key(each), unknown), each.signature.size))
 
 
 def worst_decibels(scene: ServedScene) -> float | None:
@@ -39,13 +39,17 @@ def worst_decibels(scene: ServedScene) -> float | None:
 def _of_one_model(store: SceneStore, scene: ServedScene) -> Iterator[ServedScene]:
     yield scene
     for name in store.names():
-        if name.startswith(f"{scene.name}.") and store.file(name).parent == scene.signature.path.parent:
-            try:
-                other = store.get(name)
-            except SceneFileInvalid:
-                continue  # the store logs it
-            if _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
-                yield other
+        other = _beside(store, scene, name) if name.startswith(f"{scene.name}.") else None
+        if other is not None and _metadata(other).checkpoint_sha256 == _metadata(scene).checkpoint_sha256:
+            yield other
+
+
+def _beside(store: SceneStore, scene: ServedScene, name: str) -> ServedScene | None:
+    """Return the scene `name` if its file is in the folder of that of `scene`, valid, and not removed meanwhile."""
+    try:
+        return store.get(name) if store.file(name).parent == scene.signature.path.parent else None
+    except (SceneFileInvalid, SceneNotFound):
+        return None  # the store logs what is invalid
 
 
 def _reported_milliseconds(store: SceneStore, scenes: list[ServedScene]) -> dict[tuple[str, float], float]:

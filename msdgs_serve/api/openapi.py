@@ -76,7 +76,7 @@ def problems(*statuses: int) -> Responses:
 
 
 def install_openapi(app: FastAPI, store: SceneStore, *, keys: bool) -> None:
-    """Replace the application's OpenAPI document by one with examples for the loaded scenes."""
+    """Replace the application's OpenAPI document by one with examples for the scene that is loaded."""
 
     def build() -> dict[str, Any]:
         if app.openapi_schema is None:
@@ -87,11 +87,9 @@ def install_openapi(app: FastAPI, store: SceneStore, *, keys: bool) -> None:
                 document["components"]["schemas"][model.__name__] = schema
             if keys:
                 _add_keys(document)
-            examples = render_examples(store)
-            document["paths"]["/render"]["post"]["requestBody"]["content"]["application/json"]["examples"] = examples
-            if not examples:
-                return document  # not stored, so that examples follow once a scene is loaded
             app.openapi_schema = document
+        body = app.openapi_schema["paths"]["/render"]["post"]["requestBody"]["content"]["application/json"]
+        body["examples"] = render_examples(store)
         return app.openapi_schema
 
     app.openapi = build

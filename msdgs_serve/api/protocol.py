@@ -40,6 +40,11 @@ class LimitedProtocol(H11Protocol):
         self._read_timer: asyncio.TimerHandle | None = None
         self._unsent = 0
 
+    @property
+    def unsent_bytes(self) -> int:
+        """Bytes of its response that the client hasn't read yet."""
+        return self.transport.get_write_buffer_size()
+
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the time limit of the first headers."""
         super().connection_made(transport)
@@ -111,13 +116,13 @@ class LimitedProtocol(H11Protocol):
     def _start_read_timer(self) -> None:
         if self._read_timer is not None:
             return
-        self._unsent = self.transport.get_write_buffer_size()
+        self._unsent = self.unsent_bytes
         if self._unsent:
             self._read_timer = self.loop.call_later(self._read_seconds, self._check_reading)
 
     def _check_reading(self) -> None:
         self._read_timer = None
-        if self.transport.get_write_buffer_size() > self._unsent - READ_BYTES:
+        if self.unsent_bytes > self._unsent - READ_BYTES:
             self.transport.abort()
         else:
             self._start_read_timer()

@@ -210,7 +210,8 @@ class RenderRequest(Strict):
         default="auto",
         description="`scene`: the background color of training. `transparent` or null: none, and the frame "
         "has an alpha channel (not in `jpeg`). `[r, g, b]`: sRGB-encoded, 0 to 1. `auto`: `transparent` for `exr` "
-        "and `npy`, `scene` for the others. An opaque frame has no alpha, or alpha 1 in `exr` and `npy`",
+        "and `npy`, `scene` for the others. An opaque frame has no alpha, or alpha 1 in `exr`; in `npy` alpha is the "
+        "coverage by Gaussians in any case",
     )
 
 

@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import time
+from collections import Counter
 from functools import partial
 from types import FrameType
 
@@ -10,6 +11,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from msdgs_serve.api.early_rejection import EarlyRejection
+from msdgs_serve.api.keys import client_of
 from msdgs_serve.api.protocol import LimitedProtocol
 from msdgs_serve.api.service import Phase, Service
 from msdgs_serve.api.settings import Settings
@@ -45,6 +47,7 @@ class Server(uvicorn.Server):
         super().__init__(config)
         self._drain_seconds = settings.drain_seconds
         self._drain_deadline = 0.0
+        self.service.queue.unread = self._unread
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Listen at once, so that /live answers; call `on_ready` when scenes are loaded."""
@@ -76,8 +79,16 @@ class Server(uvicorn.Server):
         """Called once when the service is ready."""
 
     def _is_idle(self) -> bool:
-        """Whether no request is in progress."""
-        return not self.server_state.tasks
+        """Whether no request is in progress, and clients have read all responses."""
+        return not self.server_state.tasks and not self._unread()
+
+    def _unread(self) -> Counter[str]:
+        """Return the bytes of responses that clients haven't read yet, by client."""
+        unread: Counter[str] = Counter()
+        for connection in self.server_state.connections:
+            if isinstance(connection, LimitedProtocol) and connection.scope and (unsent := connection.unsent_bytes):
+                unread[client_of(dict(connection.scope))] += unsent
+        return unread
 
     async def _announce(self) -> None:
         while self.service.phase is Phase.STARTING:

@@ -53,7 +53,12 @@ class Service:
         self.store = store
         self.renderer = renderer
         self.settings = settings
-        self.queue = WorkQueue(settings.concurrent_renders, settings.queued_renders, settings.render_seconds)
+        self.queue = WorkQueue(
+            settings.concurrent_renders,
+            settings.queued_renders,
+            settings.render_seconds,
+            settings.unread_megabytes << 20,
+        )
         self.uploads = Uploads(store.folder, settings)
         self.reading = anyio.CapacityLimiter(READ_AT_ONCE)
         self.metrics = Metrics(store, renderer.cache, self.queue)

@@ -110,6 +110,12 @@ class Settings(BaseSettings):
         default=10.0, gt=0, description="time limit for a request's body; for uploads, for each part of it"
     )
     read_seconds: float = Field(default=10.0, gt=0, description="time limit for reading each 64 KiB of a response")
+    unread_megabytes: int = Field(
+        default=512,
+        ge=1,
+        description="memory of responses that clients have yet to read, about half of it for one client; new requests "
+        "for frames get a 503 meanwhile",
+    )
     drain_seconds: float = Field(default=30.0, ge=0, description="how long a stopping service finishes its requests")
     watch_seconds: float = Field(default=1.0, gt=0, description="interval of checking files for changes")
     frame_max_age: int = Field(default=0, ge=0, description="seconds that caches may keep a frame without revalidation")
@@ -164,8 +170,12 @@ def _parse(parser: ArgumentParser, arguments: Sequence[str] | None, namespace: A
     return parsed
 
 
+def split_list(name: str, value: str) -> list[str]:
+    """Return the parts of a setting that is a list: paths are joined as in PATH, others by commas."""
+    return [part for part in value.split(os.pathsep if name == "scenes" else ",") if part]
+
+
 class _Environment(EnvSettingsSource):
     def decode_complex_value(self, field_name: str, field: FieldInfo, value: Any) -> Any:
-        """Split lists instead of parsing JSON: paths as in PATH, other lists at commas."""
-        separator = os.pathsep if field_name == "scenes" else ","
-        return [part for part in value.split(separator) if part]
+        """Split lists instead of parsing JSON."""
+        return split_list(field_name, value)

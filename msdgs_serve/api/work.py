@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import sys
 import threading
 import time
 from collections import Counter
@@ -64,12 +65,18 @@ class WorkQueue:
 
     Streamed calls, whose work has several parts, hold at most half of all places. A client may hold at most as many
     places as are left for others, also of those for streamed calls. `Turns` decides the order.
+
+    Calls are also rejected while clients haven't read `max_unread` bytes of responses, and calls of a client that has
+    as many unread bytes as are left for others.
     """
 
-    def __init__(self, workers: int, waiting: int, seconds: float) -> None:
+    def __init__(self, workers: int, waiting: int, seconds: float, max_unread: int = sys.maxsize) -> None:
         self._workers = workers
         self._places = workers + waiting
         self._seconds = seconds
+        self._max_unread = max_unread
+        self.unread: Callable[[], Counter[str]] = Counter
+        """Returns the unread bytes by client; set by the server that holds them."""
         self._executor = ThreadPoolExecutor(workers, "render", initializer=lower_priority)
         self._lock = threading.Lock()
         self._turns: Turns[_Piece] = Turns()
@@ -212,6 +219,8 @@ class WorkQueue:
         if detail is None and streamed:
             detail = _refusal(self._streams, client, max(1, self._places // 2), "batches and videos")
         if detail is None:
+            detail = _refusal_of_unread(self.unread(), client, self._max_unread)
+        if detail is None:
             return
         seconds = math.ceil(self._held.total() * self._mean_seconds / self._workers)
         retry_after = min(max(1, seconds), MAX_RETRY_SECONDS)
@@ -225,6 +234,16 @@ def _refusal(held: Counter[str], client: str, places: int, purpose: str) -> str 
         return f"All {places} places for {purpose} are taken; try again later."
     if held[client] >= left:
         return f"You have {held[client]} places for {purpose}, as many as are left for others."
+    return None
+
+
+def _refusal_of_unread(unread: Counter[str], client: str, limit: int) -> str | None:
+    """Return why a client gets no response before others are read, or None if it gets one."""
+    left = limit - unread.total()
+    if left <= 0:
+        return "The memory for responses is taken by those that clients haven't read yet; try again later."
+    if unread[client] >= left:
+        return f"You haven't read {unread[client]} bytes of responses, as many as are left for others."
     return None
 
 

@@ -1,17 +1,25 @@
 """Batches: each frame has a response of its own, and equal frames are rendered once."""
 
+import asyncio
 import base64
 import email
 import email.policy
 import json
+import weakref
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
+from msdgs_serve.api.app import create_app
 from msdgs_serve.api.errors import MAX_BODY_BYTES
+from msdgs_serve.api.routes import batch as route
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.renderer import Renderer
+from msdgs_serve.store import SceneStore
 from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, serving
 
@@ -77,6 +85,30 @@ def test_equal_frames_are_drawn_once(client: httpx.Client, renderer: Renderer, m
     assert len(drawn) == 3
     assert renderer.cache.use.misses - before.misses == 2, "two sizes share the pose of one time"
     assert lines[0]["data"] == lines[2]["data"]
+
+
+def test_a_batch_keeps_no_scenes_in_memory(tmp_path: Path):
+    """Each scene is loaded where all others were unloaded, in the check of the frames and in their rendering."""
+    opened: list[weakref.ref[DeformationSession]] = []
+
+    def open_scene(path: Path) -> DeformationSession:
+        assert sum(session() is not None for session in opened) <= 1
+        session = DeformationSession(path)
+        opened.append(weakref.ref(session))
+        return session
+
+    names = [f"scene {number}" for number in range(4)]
+    for number, name in enumerate(names):
+        write_scene(tmp_path / f"{name}.onnx", static_color=(number / 4, 0, 0))
+    service = create_app(SceneStore([tmp_path], open_scene, max_bytes=1), Renderer(), Settings()).state.service
+
+    async def statuses() -> list[int]:
+        frames = [{**FRAME, "scene": name} for name in names]
+        return [item.status async for item in route._items(service, frames, multipart=False)]
+
+    assert asyncio.run(statuses()) == [200] * 4
+    assert len(opened) == 2 * len(names)
+    service.queue.shut_down()
 
 
 def test_the_same_as_parts(client: httpx.Client):

@@ -224,6 +224,16 @@ def test_a_video_fails_before_its_first_byte_or_is_cut_off(scene: Path):
 
 
 @in_this_process
+@pytest.mark.parametrize("path", ["/render/batch", "/render/video"])
+def test_a_batch_or_video_needs_a_place_at_once_whatever_its_client_has(scene: Path, path: str):
+    servers: list[Server] = []
+    with serving(scene, server=servers, concurrent_renders=1, queued_renders=0) as client:
+        with servers[0].service.queue.admitted("other"):
+            assert client.post(path, json={}, headers={"If-None-Match": '"x"'}).status_code == 503
+        assert client.post(path, json={}, headers={"If-None-Match": '"x"'}).status_code == 422
+
+
+@in_this_process
 def test_a_list_of_times_is_drawn_in_parts(scene: Path):
     """Otherwise one request would occupy a thread for all of its frames."""
     servers: list[Server] = []

@@ -102,6 +102,22 @@ def test_the_calls_are_these(client: httpx.Client):
     assert set(paths["/render"]["post"]["responses"]) == answers
 
 
+def test_examples_are_for_a_scene_that_is_loaded_now(tmp_path: Path):
+    for name in ("a", "b", "c"):
+        write_scene(tmp_path / f"{name}.onnx")
+    with serving(tmp_path) as client:
+
+        def scenes() -> set[str]:
+            body = client.get("/openapi.json").json()["paths"]["/render"]["post"]["requestBody"]
+            return {each["value"]["scene"] for each in body["content"]["application/json"]["examples"].values()}
+
+        assert scenes() == {"a"}
+        (tmp_path / "a.onnx").unlink()
+        assert scenes() == set()
+        assert client.post("/render", json={**FRAME, "scene": "c"}).status_code == 200
+        assert scenes() == {"c"}
+
+
 @pytest.mark.slow
 def test_every_call_answers_as_the_document_says(client: httpx.Client):
     schema = schemathesis.openapi.from_url(f"{str(client.base_url).rstrip('/')}/openapi.json")

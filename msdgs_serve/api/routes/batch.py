@@ -4,6 +4,7 @@ import base64
 import json
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
+from dataclasses import dataclass, field, replace
 from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Any
@@ -13,6 +14,7 @@ from fastapi import APIRouter, Header
 from fastapi.responses import StreamingResponse
 from pydantic import ValidationError
 
+from msdgs_serve.api.errors import MEDIA_TYPE as PROBLEM
 from msdgs_serve.api.errors import problem_of
 from msdgs_serve.api.frames import FramePlan, draw_frame, plan_frame, server_timing
 from msdgs_serve.api.openapi import BATCH_RESPONSE, problems
@@ -28,15 +30,25 @@ MULTIPART = "multipart/mixed"
 router = APIRouter(tags=["frames"])
 
 
+@dataclass(frozen=True)
 class Item:
     """One frame of a batch, or its problem."""
 
-    def __init__(self, index: int, status: int, *, plan: FramePlan | None = None, body: bytes = b"") -> None:
-        self.index = index
-        self.status = status
-        self.plan = plan
-        self.body = body  # the image, in base64 for a JSON line; or the problem if there is no plan
-        self.timing = ""
+    index: int
+    status: int
+    body: bytes  # the image, in base64 for a JSON line; or the problem
+    media_type: str = PROBLEM
+    headers: dict[str, str] = field(default_factory=dict)  # of an image
+
+
+@dataclass(frozen=True)
+class _Equal:
+    """Checked frames that are equal. They keep no scene in memory."""
+
+    request: RenderRequest
+    scene: str
+    t: float
+    indices: list[int]
 
 
 @router.post(
@@ -73,28 +85,41 @@ async def _items(service: Service, frames: list[dict[str, Any]], multipart: bool
 
     A frame is rendered when the previous one was sent.
     """
-    planned: dict[str, list[tuple[int, FramePlan]]] = {}
+    checked: dict[str, _Equal] = {}
     for index, frame in enumerate(frames):
         try:
-            plan = await anyio.to_thread.run_sync(_plan, service, frame)
+            etag, equal = await anyio.to_thread.run_sync(_checked, service, frame)
         except (MsdgsError, ValidationError) as error:
             yield _failed(index, error)
         else:
-            planned.setdefault(plan.etag, []).append((index, plan))
-    for same in sorted(planned.values(), key=lambda plans: (plans[0][1].scene.name, plans[0][1].times[0])):
-        plan, job = same[0][1], RenderJob()
+            checked.setdefault(etag, equal).indices.append(index)
+    for equal in sorted(checked.values(), key=lambda each: (each.scene, each.t)):
         try:
-            work = partial(_drawn, service, plan, job, multipart)
-            image = await service.queue.run(work, job, part=True)
+            item = await _rendered(service, equal, multipart)
         except Exception as error:
-            for index, _ in same:
+            for index in equal.indices:
                 yield _failed(index, error)
             continue
-        service.metrics.count_stages(job.seconds)
-        for index, _ in same:
-            item = Item(index, HTTPStatus.OK, plan=plan, body=image)
-            item.timing = server_timing(job)
-            yield item
+        for index in equal.indices:
+            yield replace(item, index=index)
+
+
+def _checked(service: Service, frame: dict[str, Any]) -> tuple[str, _Equal]:
+    """Return the ETag of a valid frame, and what is needed to render it."""
+    request = RenderRequest.model_validate(frame)
+    if isinstance(request.t, list):
+        raise InvalidInput("t", "a single time; use one frame per time", "a list")
+    plan = plan_frame(service, request)
+    return plan.etag, _Equal(request, plan.scene.name, request.t, [])
+
+
+async def _rendered(service: Service, equal: _Equal, multipart: bool) -> Item:
+    """Render the first of equal frames. The scene, which may have been unloaded since the check, is free afterwards."""
+    plan, job = await anyio.to_thread.run_sync(plan_frame, service, equal.request), RenderJob()
+    image = await service.queue.run(partial(_drawn, service, plan, job, multipart), job, part=True)
+    service.metrics.count_stages(job.seconds)
+    headers = plan.headers(0) | {"Server-Timing": server_timing(job)}
+    return Item(equal.indices[0], HTTPStatus.OK, image, plan.media_type, headers)
 
 
 def _drawn(service: Service, plan: FramePlan, job: RenderJob, multipart: bool) -> bytes:
@@ -103,32 +128,23 @@ def _drawn(service: Service, plan: FramePlan, job: RenderJob, multipart: bool) -
     return image if multipart else base64.b64encode(image)
 
 
-def _plan(service: Service, frame: dict[str, Any]) -> FramePlan:
-    request = RenderRequest.model_validate(frame)
-    if isinstance(request.t, list):
-        raise InvalidInput("t", "a single time; use one frame per time", "a list")
-    return plan_frame(service, request)
-
-
 def _failed(index: int, error: Exception) -> Item:
     status, body = problem_of(error)
-    return Item(index, status, body=body)
+    return Item(index, status, body)
 
 
 def _line(item: Item) -> bytes:
     line = BatchItem(index=item.index, status=item.status)
-    if item.plan is None:
+    if item.media_type == PROBLEM:
         line.problem = json.loads(item.body)
         return line.model_dump_json(exclude_none=True).encode() + b"\n"
-    line.media_type = item.plan.media_type
+    line.media_type = item.media_type
     head = line.model_dump_json(exclude_none=True).encode().removesuffix(b"}")
     return b"".join((head, b',"data":"', item.body, b'"}\n'))
 
 
 def _part(item: Item) -> bytes:
-    head = {"Content-Type": "application/problem+json", "Content-Length": str(len(item.body))}
-    if item.plan is not None:
-        head |= {**item.plan.headers(0), "Content-Type": item.plan.media_type, "Server-Timing": item.timing}
+    head = {"Content-Type": item.media_type, "Content-Length": str(len(item.body)), **item.headers}
     head |= {"Msdgs-Index": str(item.index), "Msdgs-Status": str(item.status)}
     lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
     return f"--{BOUNDARY}\r\n{lines}\r\n".encode() + item.body + b"\r\n"
