@@ -202,7 +202,8 @@ def test_a_time_range_of_one_time(tmp_path: Path):
 @pytest.mark.parametrize("kind", ["plane", "splines on nodes"])
 def test_times_that_do_not_begin_at_0(tmp_path: Path, kind: str, plan: str, row: str):
     """The motion is that of the same layers from 0 to 1."""
-    some, ends = random_model(60, **FORMATS[kind] | {"noise": 0.2}), (2.0, 4.5)
+    settings: dict[str, Any] = FORMATS[kind] | {"noise": 0.2}
+    some, ends = random_model(60, **settings), (2.0, 4.5)
     later = DynamicGaussians(some.config, some.gaussians, SceneBounds(1.0, ends))
     of_time = {name: values for name, values in later.named_buffers() if "time" in name}
     later.load_state_dict(some.state_dict() | of_time)
