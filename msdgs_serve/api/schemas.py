@@ -210,8 +210,7 @@ class RenderRequest(Strict):
         default="auto",
         description="`scene`: the background color of training. `transparent` or null: none, and the frame "
         "has an alpha channel (not in `jpeg`). `[r, g, b]`: sRGB-encoded, 0 to 1. `auto`: `transparent` for `exr` "
-        "and `npy`, `scene` for the others. An opaque frame has no alpha, or alpha 1 in `exr`; in `npy` alpha is the "
-        "coverage by Gaussians in any case",
+        "and `npy`, `scene` for the others. Opaque frames: no alpha; 1 in `exr`, coverage in `npy`",
     )
 
 

@@ -320,16 +320,11 @@ def test_it_reports_an_unavailable_service_and_recovers(page: Page, scenes: Path
 
 
 def test_a_frame_whose_connection_breaks_is_asked_for_again(page: Page, client: httpx.Client):
-    page.add_init_script("""
-        const whole = Response.prototype.blob;
-        Response.prototype.blob = function () {
-            const breaks = window.breaks;
-            window.breaks = false;
-            return breaks ? Promise.reject(new TypeError("network error")) : whole.call(this);
-        };
-    """)
     open_page(page, client)
-    page.evaluate("window.breaks = true")
+    page.evaluate("""() => {
+        const whole = Response.prototype.blob;
+        Response.prototype.blob = () => { Response.prototype.blob = whole; return Promise.reject(new TypeError()); };
+    }""")
     page.locator("#image").focus()
     page.keyboard.press("ArrowLeft")
     page.get_by_text("The service doesn’t answer").wait_for()

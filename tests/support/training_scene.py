@@ -12,11 +12,11 @@ import torch
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
-from msdgs_train.datasets import SceneData
+from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import to_bytes
-from msdgs_train.engine.optimizer import make_optimizer
+from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.run import Observer
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.engine.trainer import StepResult, Trainer
@@ -117,6 +117,14 @@ def splatting(trainer: Trainer) -> GaussianSplatting:
     """The system of a trainer, as `GaussianSplatting`."""
     assert isinstance(trainer.system, GaussianSplatting)
     return trainer.system
+
+
+def learning_rates(config: TrainConfig, data: Path, step: int) -> dict[str, float]:
+    """The rates at a step, by the name of the group."""
+    trainer = Trainer(config, load_scene(data))
+    groups = trainer.system.parameter_groups()
+    set_learning_rates(trainer.optimizer, groups, trainer.schedule, step, 1.0)
+    return {group["name"]: group["lr"] for group in trainer.optimizer.param_groups}
 
 
 def trained(config: TrainConfig, scene: SceneData, steps: int) -> Trainer:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,8 @@ from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.gradients import average_gradients
 from msdgs_train.engine.metrics_log import MetricsLog, read_metrics
-from msdgs_train.engine.optimizer import set_learning_rates
-from msdgs_train.engine.run import Observer, fit
-from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
+from msdgs_train.engine.run import fit
+from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.gaussians.safe_load import CheckpointInvalid
@@ -40,6 +38,7 @@ from tests.support.training_scene import (
     SIZE,
     StopAfter,
     assert_same_bits,
+    learning_rates,
     small_config,
     splatting,
     state_of,
@@ -175,24 +174,6 @@ def test_a_run_is_saved_before_its_last_evaluation(data: Path, tmp_path: Path, m
     assert (saved.step, saved.scene.llffhold) == (2, 3)
 
 
-@pytest.mark.parametrize(
-    "loss",
-    [lambda rgb: rgb.sum() * float("nan"), lambda rgb: rgb.sum() + (rgb - rgb.detach()).sum().sqrt()],
-    ids=["loss", "gradient"],
-)
-def test_a_loss_or_gradient_that_is_not_finite_is_skipped(
-    data: Path, monkeypatch: pytest.MonkeyPatch, loss: Callable[[torch.Tensor], torch.Tensor]
-) -> None:
-    trainer = trained(small_config(steps=100, refine_every_fraction=0.0), load_scene(data), 1)
-    before = [p.detach().clone() for p in splatting(trainer).model.parameters()]
-    monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, *others: loss(rgb))
-    result = trainer.step()
-    assert (result.step, result.skipped) == (2, 1)
-    assert all(torch.equal(a, b) for a, b in zip(before, splatting(trainer).model.parameters(), strict=True))
-    with pytest.raises(TrainingDiverged, match="up to step 21"):
-        [trainer.step() for _ in range(19)]
-
-
 def test_images_of_a_step_share_it_evenly(data: Path) -> None:
     config = small_config(static_fraction=0.0, window_full_fraction=0.0, refine_every_fraction=0.0)
     scene = load_scene(data)
@@ -229,89 +210,6 @@ def test_a_gradient_is_the_mean_over_the_images_that_update_the_parameter(data: 
     assert torch.equal(means.grad, first.gradients[id(means)])
 
 
-class _Rollbacks(Observer):
-    def __init__(self) -> None:
-        self.seen: list[tuple[int, float]] = []
-        self.steps: list[int] = []
-
-    def step(self, result: StepResult, seconds: float) -> None:
-        self.steps.append(result.step)
-
-    def rolled_back(self, reason: str, step: int, lr_factor: float) -> None:
-        assert "not finite" in reason
-        self.seen.append((step, lr_factor))
-
-
-def _break_losses(monkeypatch: pytest.MonkeyPatch, broken: range) -> None:
-    """Make losses of these calls, counted over all trainers, not finite."""
-    calls = iter(range(10**6))
-
-    whole = system_module.photometric_loss
-
-    def breaking(*arguments: Any) -> torch.Tensor:
-        return whole(*arguments) * (float("nan") if next(calls) in broken else 1.0)
-
-    monkeypatch.setattr(system_module, "photometric_loss", breaking)
-
-
-@pytest.mark.usefixtures("no_curve")
-@pytest.mark.parametrize(("start", "back_to"), [(13, 10), (25, 20), (4, 0)])
-def test_after_repeats_training_goes_back_to_the_last_good_checkpoint(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, start: int, back_to: int
-) -> None:
-    """Also if a checkpoint is due while steps are skipped: step 20 of the first case."""
-    _break_losses(monkeypatch, range(start, start + 20))
-    run, watched = tmp_path / "run", _Rollbacks()
-    outcome = fit(small_config(steps=50, checkpoint_every=10, eval_every=0), data, run, observer=watched)
-    assert (outcome.status, outcome.step) == ("finished", 50)
-    assert watched.seen == [(back_to, 0.5)]
-    assert watched.steps == [*range(1, start + 20), *range(back_to + 1, 51)]
-    lines = [line for line in read_metrics(run) if line["kind"] == "train"]
-    assert [line["step"] for line in lines] == list(range(1, 51))
-    assert lines[-1]["skipped"] == 20
-    state = torch.load(run / "checkpoint.pt", weights_only=True)
-    assert state["rollbacks"] == 1
-    rates = {group["name"]: group["lr"] for group in state["optimizer"]["param_groups"]}
-    assert rates["means"] == pytest.approx(0.5 * _rates(small_config(steps=50), data, 49)["means"])
-    load_model(run / "model.pt")
-
-
-class _StopsAt(Observer):
-    def __init__(self, step: int) -> None:
-        self.at, self.last = step, 0
-
-    def step(self, result: StepResult, seconds: float) -> None:
-        self.last = result.step
-
-    def should_stop(self) -> bool:
-        return self.last >= self.at
-
-
-@pytest.mark.usefixtures("no_curve")
-def test_an_interruption_while_steps_are_skipped_keeps_the_last_good_checkpoint(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _break_losses(monkeypatch, range(13, 25))
-    config, run = small_config(steps=30, checkpoint_every=10, eval_every=0), tmp_path / "run"
-    assert fit(config, data, run, observer=_StopsAt(16)).status == "interrupted"
-    assert torch.load(run / "checkpoint.pt", weights_only=True)["step_count"] == 10
-    assert fit(config, data, run, resume=True).status == "finished"
-
-
-@pytest.mark.usefixtures("no_curve")
-def test_a_run_that_diverges_again_and_again_ends_with_its_last_good_checkpoint(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _break_losses(monkeypatch, range(15, 10**6))
-    watched = _Rollbacks()
-    config = small_config(steps=200, checkpoint_every=10, eval_every=0)
-    with pytest.raises(TrainingDiverged, match=r"after 3 returns .* lower ones"):
-        fit(config, data, tmp_path / "run", observer=watched)
-    assert watched.seen == [(10, 0.5), (10, 0.25), (10, 0.125)]
-    assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["step_count"] == 10
-    load_model(tmp_path / "run" / "model.pt")
-
-
 @pytest.mark.usefixtures("no_curve")
 def test_a_checkpoint_without_one_of_its_values_is_refused(data: Path, tmp_path: Path) -> None:
     config, checkpoint = small_config(steps=2), tmp_path / "run" / "checkpoint.pt"
@@ -324,18 +222,6 @@ def test_a_checkpoint_without_one_of_its_values_is_refused(data: Path, tmp_path:
             with pytest.raises(CheckpointInvalid, match=r"checkpoint\.pt: isn't (of format|a complete checkpoint)"):
                 fit(config.updated(steps=4), data, tmp_path / "run", resume=True)
             part[name] = value
-
-
-def test_the_order_of_images_is_another_one_after_a_rollback(data: Path, tmp_path: Path) -> None:
-    def next_frames(trainer: Trainer) -> list[str]:
-        return [trainer._curriculum.next(0, 0, trainer._generator).name for _ in range(7)]
-
-    trainer, other = (Trainer(small_config(window_full_fraction=0.0), load_scene(data)) for _ in range(2))
-    first = next_frames(trainer)
-    assert first == next_frames(other)
-    trainer.roll_back(tmp_path / "no checkpoint yet")
-    assert next_frames(trainer) != first
-    assert (trainer.rollbacks, trainer.lr_factor) == (1, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -394,13 +280,6 @@ def test_an_outlier_of_a_gradient_is_clipped(data: Path, monkeypatch: pytest.Mon
     assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer_module.MAX_GRADIENT_NORM)
 
 
-def _rates(config: TrainConfig, data: Path, step: int) -> dict[str, float]:
-    trainer = Trainer(config, load_scene(data))
-    groups = trainer.system.parameter_groups()
-    set_learning_rates(trainer.optimizer, groups, trainer.schedule, step, 1.0)
-    return {group["name"]: group["lr"] for group in trainer.optimizer.param_groups}
-
-
 def test_learning_rates(data: Path) -> None:
     assert exponential(1.0, 0.01, 0, 100) == 1.0
     assert exponential(1.0, 0.01, 50, 100) == pytest.approx(0.1)
@@ -408,7 +287,7 @@ def test_learning_rates(data: Path) -> None:
     layers = (dataclasses.replace(MLP, lr_init=1.0, lr_final=1e-3), dataclasses.replace(MLP, lr_init=2.0), PLANE)
     model = ModelConfig(sh_degree=1, support=NodesConfig(num_nodes=4), layers=layers, embedding_dim=4)
     config = small_config(model=model)
-    first, middle, last = (_rates(config, data, step) for step in (0, 18, 24))
+    first, middle, last = (learning_rates(config, data, step) for step in (0, 18, 24))
     assert last["means"] == pytest.approx(8e-6)
     assert first["means"] == config.optimizer.means_lr_init > middle["means"] > last["means"]
     assert first["layers.0.network"] == middle["layers.0.network"] == 1.0, "held while the window grows, to step 18"
