@@ -154,19 +154,14 @@ LOOP = """
     }> (trips, go, one)
 }
 """
-BROADCASTING = """
-row_now = Mul(row, t)
+VAST = """
 vast = Add(row_now, column)
 few = Gather(vast, first)
 largest = Gather <axis = 1> (few, first)
 """
-SQUEEZING = """
-stacked = Mul(rows, t)
-row_now = Squeeze(stacked, none)
-vast = Add(row_now, column)
-few = Gather(vast, first)
-largest = Gather <axis = 1> (few, first)
-"""
+"""A column of 40,000 numbers plus `row_now`, which makes 6 GB of as long a row."""
+BROADCASTING = f"row_now = Mul(row, t) {VAST}"
+SQUEEZING = f"stacked = Mul(rows, t) row_now = Squeeze(stacked, none) {VAST}"
 REDUCING = """
 stacked = Mul(rows, t)
 product = ReduceProd <keepdims = 0> (stacked, none)
