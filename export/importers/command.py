@@ -64,6 +64,8 @@ def _splats(path: Path, file_format: str, output: Path, console: Console, min_ps
         path = path.parent  # its limits and its digest are those of all files
     with console.status(f"reading {path}"):
         source = read_splats(path, file_format)
+        for warning in source.warnings:
+            console.print(f"warning: {warning}", markup=False)
         contents = static_scene(source, digest(path))
         return write_imported(output, contents, lambda t: source.gaussians, [0.0], min_psnr=min_psnr)
 

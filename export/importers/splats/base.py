@@ -31,6 +31,7 @@ class Splats:
     dropped: int = 0  # had NaN, infinity or a quaternion without direction, and are not in `gaussians`
     antialiasing: str = "dilate"  # or "mip", if the file says so
     quat_lengths: FloatArray | None = None  # [N] of the stored quaternions; None: all 1
+    warnings: tuple[str, ...] = ()  # what a user should know about the file, each one sentence
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -45,7 +46,10 @@ class Splats:
         """The splats of `to_arrays`, read in another process. Raises `InvalidInput` for invalid arrays."""
         names = [field.name for field in fields(Gaussians)]
         gaussians = Gaussians(*(arrays[name] for name in names)).validate()
-        return Splats(gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), arrays.get("quat_lengths"))
+        warnings = tuple(str(each) for each in arrays["warnings"])
+        return Splats(
+            gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), arrays.get("quat_lengths"), warnings
+        )
 
 
 def splats(

@@ -55,6 +55,7 @@ class SceneData:
     points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
     point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None if `points` have no colors
     unsplit: list[Frame] | None = None  # all frames in their order, if the dataset itself names no splits
+    warnings: tuple[str, ...] = ()  # what a user should know about the files, each one sentence with its remedy
 
     @cached_property
     def time_range(self) -> tuple[float, float]:

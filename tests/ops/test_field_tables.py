@@ -1,0 +1,23 @@
+"""docs/formats.md shows for each format what its reader does with each field."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from msdgs_train.datasets.common.fields import FieldTable
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
+TABLES: tuple[FieldTable, ...] = ()
+
+
+def documented(section: str) -> dict[str, str]:
+    """Use of each field by name, as the page's table under this heading has it."""
+    text = PAGE.read_text(encoding="utf-8").partition(f"### {section}\n")[2].partition("\n#")[0]
+    rows = re.findall(r"^\| (`.*`) \| (applied|refused|harmless)\b", text, flags=re.MULTILINE)
+    return {name: use for names, use in rows for name in re.findall("`([^`]+)`", names)}
+
+
+@pytest.mark.parametrize("table", TABLES, ids=lambda table: table.format)
+def test_the_page_shows_the_table(table: FieldTable):
+    assert documented(table.format) == dict(table.uses)
