@@ -1,7 +1,7 @@
 """Default view of a scene, from its cameras or its bounds."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +30,16 @@ class Framing:
 
 
 def framing(metadata: SceneMetadata) -> Framing:
-    """Return the default view from the scene's cameras, or from its bounds if it has none (then z is up)."""
+    """Return the default view in the user's world, from the scene's cameras, or from its bounds if it has none (then z
+    is up)."""
+    view, place = scene_framing(metadata), metadata.scene_to_world
+    if place.is_identity:
+        return view
+    return replace(view, target=place.to_world(view.target), distance=place.scale * view.distance)
+
+
+def scene_framing(metadata: SceneMetadata) -> Framing:
+    """Return the default view in the frame of the scene's graph."""
     low, high = np.asarray(metadata.bounds, dtype=np.float64)
     target = (low + high) / 2
     if not metadata.cameras:

@@ -72,7 +72,7 @@ class Renderer:
         options: RenderOptions = DEFAULT_OPTIONS,
         job: RenderJob | None = None,
     ) -> Image:
-        """Return the frame that `camera` sees at `t`. Equal arguments give equal pixels.
+        """Return the frame that `camera`, in the user's world, sees at `t`. Equal arguments give equal pixels.
 
         `job` times the stages `pose` and `draw`.
 
@@ -109,10 +109,12 @@ class Renderer:
         with job.stage("draw"), session.as_scene_file_error(time):
             background = resolve_background(session, options.background)
             constants = as_trained(session.scene.metadata, options.rasterizer)
-            extra = None if later is None else displacements(gaussians, later, camera)
+            place = session.scene.metadata.scene_to_world
+            seen_from = place.camera_to_scene(camera)
+            extra = None if later is None else displacements(gaussians, later, seen_from)
             drawn = rasterize(
                 gaussians,
-                camera,
+                seen_from,
                 background=background,
                 depth=options.depth,
                 extra=extra,
@@ -121,8 +123,14 @@ class Renderer:
             )
             transparent = options.background == "transparent"
             motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]
-            depth, counts = drawn.depth if options.depth else None, drawn.counts if options.counts else None
+            counts = drawn.counts if options.counts else None
+            depth = in_world_units(drawn.depth, place.scale) if options.depth else None
             return Image(drawn.rgb, drawn.alpha, depth, transparent, camera, t, motion, counts)
+
+
+def in_world_units(depth: np.ndarray, scale: float) -> np.ndarray:
+    """Return depths of the scene's frame, float32, in units of the world."""
+    return depth if scale == 1.0 else depth * np.float32(scale)
 
 
 def displacements(now: Gaussians, later: Gaussians, camera: Camera) -> np.ndarray:

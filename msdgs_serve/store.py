@@ -21,6 +21,7 @@ from msdgs_serve.files import Signature, move, sync
 from msdgs_serve.files import signature as signature_of
 from msdgs_serve.framing import Framing, framing
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
+from msdgs_serve.scene.metadata import SceneMetadata
 
 SUFFIX = ".onnx"
 INCOMING_PREFIX = ".incoming-"
@@ -64,6 +65,11 @@ class ServedScene:
     def framing(self) -> Framing:
         """The default view; cached, as every request needs it."""
         return framing(self.session.scene.metadata)
+
+    @cached_property
+    def metadata(self) -> SceneMetadata:
+        """The scene's metadata, with bounds and cameras in the user's world."""
+        return self.session.scene.metadata.in_world()
 
 
 @dataclass(frozen=True)

@@ -67,12 +67,13 @@ def main(
 
 def views_of(data: Path, split: str, size: int | None, model: Path) -> list[View]:
     """Views from the cameras of a split, as an export has them from its own."""
-    splits = load_scene(data, size).splits
+    info = load_model(model).scene
+    splits = load_scene(data, size).in_frame(info.placement).splits
     frames = splits.get(split, [])
     if not frames:
         raise InvalidInput("split", f"one with images: {', '.join(name for name in splits if splits[name])}", split)
     named = [(f"{split} {i}", frame.camera) for i, frame in enumerate(frames)]
-    return evaluation_views(named, load_model(model).scene.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
+    return evaluation_views(named, info.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
 
 
 def report(scene: Path, model: Path, views: list[View], console: Console) -> None:

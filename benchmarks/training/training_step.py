@@ -104,7 +104,7 @@ def make_trainer(options: Options, made: Path, images: int, device: str = "cpu")
         half_resolution_fraction=0.0,
         refine_stop_fraction=0.0,
     )
-    trainer = Trainer(config, load_scene(data, options.size))
+    trainer = Trainer(config, load_scene(data, options.size).normalized())
     assert trainer.schedule.deforms(0) or not config.model.layers
     assert trainer.schedule.sh_degree(0) == config.model.sh_degree
     return trainer

@@ -29,6 +29,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.similarity import Similarity
 from msdgs_train.datasets.common.files import replacing, write_text
 
 LOSSLESS, LOSSY = 60.0, 45.0
@@ -38,6 +39,8 @@ ONNX, VISIONARY = ".onnx", ".visionary.onnx"
 SINGLE = (".ply", ".spz", ".glb")
 USD = (".usdc", ".usda", ".usd")
 VIDEOS = (".mp4", ".webm")
+OFFSET = "offset.json"
+"""Ending of the file that holds the `Similarity` from the positions of a written file to the world."""
 COMPARED = 5
 """Number of times at which a moving scene is compared."""
 
@@ -69,23 +72,39 @@ def convert(options: ConvertOptions, console: Console) -> None:
         names = f"{', '.join((*SINGLE, *USD, ONNX))} or {VISIONARY}"
         raise InvalidInput("out", f"a folder (of a name with a dot: an existing one), or named {names}", out.name)
     console.print(f"{out}: {written} against the scene", markup=False)
+    _note_offset(out, session.scene.metadata.scene_to_world, console)
     eps2d = session.scene.metadata.eps2d
     if eps2d != GSPLAT.eps2d:
         drawn = "blurrier" if eps2d < GSPLAT.eps2d else "sharper"
         console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
 
 
+def _note_offset(out: Path, place: Similarity, console: Console) -> None:
+    """Tell where the world's coordinates of a far scene are kept, and write them beside formats that have no place."""
+    if not any(place.offset) or (out.suffix == ONNX and not out.name.endswith(VISIONARY)):
+        return
+    x, y, z = place.offset
+    where = "in the transform of its node"
+    if out.suffix not in (*USD, ".glb"):
+        file = out / OFFSET if out.is_dir() else out.with_suffix(f".{OFFSET}")
+        scale = place.scale if out.name.endswith(VISIONARY) else 1.0  # others are in units of the world
+        write_text(file, json.dumps(Similarity(scale, place.offset).to_plain()) + "\n")
+        where = f"which {file} holds"
+    console.print(f"positions are relative to ({x:.12g}, {y:.12g}, {z:.12g}) in the world, {where}", markup=False)
+
+
 def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: float) -> float:
     """Write a file of one time; returns its PSNR against the scene, dB."""
     metadata = session.scene.metadata
-    gaussians = of_the_moment(session.gaussians(t), metadata.plan)
+    place = metadata.scene_to_world
+    gaussians = of_the_moment(session.gaussians(t), metadata.plan).scaled(place.scale)
     with replacing(file) as temporary:
         if file.suffix == ".spz":
             write_spz(temporary, gaussians, metadata.antialiasing)
         elif file.suffix == ".ply":
             write_ply(temporary, gaussians, metadata.antialiasing)
         else:
-            write_gltf(temporary, gaussians, framing(metadata).up)
+            write_gltf(temporary, gaussians, framing(metadata).up, place.offset)
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
         psnr = RoundTrip(session).psnr(written, t)
         require(psnr, options.min_psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
@@ -123,11 +142,19 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
     check = RoundTrip(session)
 
     def pose(t: float) -> Gaussians:
-        return of_the_moment(session.gaussians(t), metadata.plan)
+        return of_the_moment(session.gaussians(t), metadata.plan).scaled(metadata.scene_to_world.scale)
 
     with tracked(console) as progress, replacing(out) as temporary:
         on_frame = progress("writing frames", len(times))
-        write_usd(temporary, pose, times, session.scene.changing, on_frame, framing(metadata).up)
+        write_usd(
+            temporary,
+            pose,
+            times,
+            session.scene.changing,
+            on_frame,
+            framing(metadata).up,
+            metadata.scene_to_world.offset,
+        )
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
         worst = min(check.psnr(shown(number), times[number]) for number in compared)

@@ -2,13 +2,14 @@
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from export.importers.scene import UP
-from export.importers.splats.axes import from_right_up_back, upright
+from export.importers.splats.axes import from_right_up_back, upright, upright_offset
 from msdgs_serve.imaging.image import srgb_to_linear
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -28,9 +29,11 @@ PRIMITIVE = {
 }
 
 
-def write_gltf(file: Path, gaussians: Gaussians, up: np.ndarray = UP) -> None:
+def write_gltf(
+    file: Path, gaussians: Gaussians, up: np.ndarray = UP, offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> None:
     """Write all Gaussians, activated, float32; axes right, up, back, and a node whose rotation turns the scene's `up`,
-    [3], to y. Viewers without the extension show points.
+    [3], to y and that is moved by `offset`, [3], in the scene's axes. Viewers without the extension show points.
 
     Raises `InvalidInput` for none, which glTF can't hold, and for more than 4 GiB.
     """
@@ -59,7 +62,7 @@ def write_gltf(file: Path, gaussians: Gaussians, up: np.ndarray = UP) -> None:
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": upright(up)}],
+        "nodes": [{"mesh": 0, "rotation": upright(up), **_translation(offset, up)}],
         "meshes": [{"primitives": [_primitive(list(attributes))]}],
         "buffers": [{"byteLength": at}],
         "bufferViews": views,
@@ -78,7 +81,7 @@ def write_gltf(file: Path, gaussians: Gaussians, up: np.ndarray = UP) -> None:
 
 
 def read_gltf(file: Path) -> Gaussians:
-    """Read a file of `write_gltf`, in the axes of the scene: without the rotation of its node."""
+    """Read a file of `write_gltf`, in the axes of the scene: without the rotation and translation of its node."""
     contents = file.read_bytes()
     size, _ = CHUNK.unpack_from(contents, HEADER.size)
     start = HEADER.size + CHUNK.size
@@ -96,6 +99,10 @@ def read_gltf(file: Path) -> Gaussians:
     quats = read(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]]
     means, quats, sh = (array.astype(np.float32) for array in from_right_up_back(read("POSITION"), quats, sh))
     return Gaussians(means, quats, read(f"{EXTENSION}:SCALE"), read(f"{EXTENSION}:OPACITY")[:, 0], sh).validate()
+
+
+def _translation(offset: Sequence[float], up: np.ndarray) -> dict[str, list[float]]:
+    return {"translation": upright_offset(offset, up)} if any(offset) else {}
 
 
 def _sh_names(degree: int) -> list[str]:

@@ -9,7 +9,7 @@ import onnxruntime as ort
 from export.exporters.visionary import COLORS, COUNT, GAUSSIANS, unpacked
 from export.measure.frames import compare, render
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.framing import framing
+from msdgs_serve.framing import scene_framing
 from msdgs_serve.rasterizer import as_trained
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import MsdgsError
@@ -31,7 +31,7 @@ class RoundTrip:
         self._session, metadata = session, session.scene.metadata
         options = as_trained(metadata)
         self._options = options._replace(mip=options.mip and mip)
-        view = framing(metadata)
+        view = scene_framing(metadata)
         shown = SIZE / min(view.width, view.height)
         size = max(1, round(view.width * shown)), max(1, round(view.height * shown))
         poses = [orbit(view.target, view.distance, 360 * i / VIEWS, ELEVATION, view.up) for i in range(VIEWS)]
@@ -39,8 +39,9 @@ class RoundTrip:
         self._background = metadata.background
 
     def psnr(self, got: Gaussians, t: float) -> float:
-        """PSNR of the worst view, dB; frames are clamped to [0, 1]."""
-        both = (got, self._session.gaussians(t))
+        """PSNR of the worst view, dB, of Gaussians in units of the world; frames are clamped to [0, 1]."""
+        scale = self._session.scene.metadata.scene_to_world.scale
+        both = (got.scaled(1 / scale), self._session.gaussians(t))
 
         def frames(camera: Camera) -> list[np.ndarray]:
             return [render(each, camera, self._background, self._options).astype(np.float64) for each in both]

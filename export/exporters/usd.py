@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from export.importers.scene import UP
-from export.importers.splats.axes import from_right_up_back, upright
+from export.importers.splats.axes import from_right_up_back, upright, upright_offset
 from export.importers.splats.base import as_float32
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -30,9 +30,10 @@ def write_usd(
     changing: Sequence[str] = (),
     on_frame: Callable[[], object] = lambda: None,
     up: np.ndarray = UP,
+    offset: Sequence[float] = (0.0, 0.0, 0.0),
 ) -> None:
     """Write the Gaussians at some times as frames 0, 1, …, or one time without samples. float32, activated; the prim is
-    rotated so that the scene's `up`, [3], is y.
+    rotated so that the scene's `up`, [3], is y, and moved by `offset`, [3], in the scene's axes.
 
     Opacities and SH are those of the first time unless they are `changing`. Raises `InvalidInput` if OpenUSD or its
     schema is missing.
@@ -45,6 +46,8 @@ def write_usd(
     prim = field.GetPrim()
     stage.SetDefaultPrim(prim)
     x, y, z, w = upright(up)
+    if any(offset):
+        geom.Xformable(prim).AddTranslateOp(geom.XformOp.PrecisionDouble).Set(gf.Vec3d(*upright_offset(offset, up)))
     geom.Xformable(prim).AddOrientOp(geom.XformOp.PrecisionDouble).Set(gf.Quatd(w, x, y, z))
     for number, t in enumerate(times):
         g = gaussians(t)

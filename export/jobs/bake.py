@@ -120,6 +120,7 @@ def _metadata(
         package_version=__version__,
         checkpoint_sha256=checkpoint_sha256,
         eps2d=float(model.config.eps2d),
+        scene_to_world=info.placement,
     )
     # through the reader of scene files, which refuses invalid values
     return SceneMetadata.from_properties(draft.to_properties(), "the model's scene")

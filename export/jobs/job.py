@@ -134,7 +134,7 @@ class ExportJob:
         views = within_memory(views, len(self.model.gaussians))
         on_frame = self.progress("exact frames in float64", len(views))
         pose, options = in_float64(self.model, self.on_work), self.model.rasterizer
-        return ExactFrames(pose, views, self.info.background, options, on_frame)
+        return ExactFrames(pose, views, self.info.background, options, on_frame, self.info.placement.scale)
 
     @cached_property
     def exact_images_psnr(self) -> float | None:

@@ -49,7 +49,7 @@ LEGEND = """\
 - **memory**: peak while loading the file and drawing a frame, above that of the idle process.
 - **worst frame**, **mean**: PSNR in dB against frames of the exact network, deformation and rasterizer in float64.
 - **worst pixel**: largest difference of a channel, out of 1. **position**, **px**: largest displacement of
-  a Gaussian, in scene units and in pixels, transparent and hidden ones included.
+  a Gaussian, in world units and in pixels, transparent and hidden ones included.
 - **held-out**: mean PSNR in dB against held-out images.
 - **MB**: 10⁶ bytes. MB and errors are those of a file whose arrays have fewer bits, or, if marked *, float32.
 """

@@ -63,7 +63,8 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
         views = list({view.name: view for view in views}.values())
     ids = np.arange(len(exact.scene))
     views = within_memory(views, len(ids))
-    frames = ExactFrames(exact.gaussians, views, metadata.background, as_trained(metadata))
+    place = metadata.scene_to_world
+    frames = ExactFrames(exact.gaussians, views, metadata.background, as_trained(metadata), unit=place.scale)
 
     def measured(model: onnx.ModelProto, every: int) -> RenderedError:
         return frames.measure(session(model).gaussians, ids, every=every)

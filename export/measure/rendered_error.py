@@ -36,7 +36,7 @@ class RenderedError:
     psnr_worst: float  # dB, of the worst frame
     worst_frame: WorstFrame | None  # None if nothing was drawn
     worst_pixel: float  # largest difference of a channel, in [0, 1]
-    position: float  # largest displacement of a Gaussian, scene units
+    position: float  # largest displacement of a Gaussian, world units
     position_pixels: float  # the same in pixels, of Gaussians inside the image
     frames: int
 
@@ -55,7 +55,10 @@ class ExactFrames:
         background: Sequence[float],
         options: RasterizerOptions,
         on_frame: Callable[[], object] = lambda: None,
+        unit: float = 1.0,
     ) -> None:
+        """`unit`: world units per unit of the poses."""
+        self._unit = unit
         self.pose, self.views, self.background, self.options = pose, views, background, options
         self._frames: list[FloatArray] = []
         self._poses: dict[float, Gaussians] = {}
@@ -85,7 +88,7 @@ class ExactFrames:
             gaussians = pose(t)
             exact_means = self._poses[t].means[ids]
             distances = np.linalg.norm(gaussians.means - exact_means, axis=1)
-            position = max(position, float(distances.max(initial=0)))
+            position = max(position, self._unit * float(distances.max(initial=0)))
             for view in views:
                 drawn = render(gaussians, view.camera, self.background, self.options)
                 difference = compare(drawn, frames[id(view)])

@@ -178,7 +178,7 @@ class _Assessment:
         return WorstGaussians(
             t=t,
             ids=ids.tolist(),
-            center=center.tolist(),
+            center=self.scene.placement.to_world(center).tolist(),
             spread=float(np.linalg.norm(means - center, axis=1).mean()) / self.size,
             outside_bounds=int(((means < low) | (means > high)).any(axis=1).sum()),
             moved=float(np.median(np.linalg.norm(means - canonical, axis=1))) / self.size,

@@ -74,7 +74,7 @@ def verify(
                     raise VerificationFailed(f"{problem}, allowed is {tolerance:g}")
         on_time()
     return {
-        **_displacements(np.concatenate(distances, axis=1)),
+        **_displacements(np.concatenate(distances, axis=1), stated.scene_to_world.scale),
         **worst["float64"],
         "against": "model in float64",
         "against_float32": worst["float32"],
@@ -96,10 +96,14 @@ def differences(got: DeformationSession, expected: DeformationSession) -> dict[s
     return worst
 
 
-def _displacements(distances: np.ndarray) -> dict[str, Any]:
-    """Entries of `measured_error` from all `_distances`."""
+def _displacements(distances: np.ndarray, unit: float) -> dict[str, Any]:
+    """Entries of `measured_error` from all `_distances`; `unit`: world units per scene unit."""
     position, angle, displacement = np.fmax.reduce(distances, axis=1, initial=0).tolist()
-    return {"position": position, "displacement": displacement, "rotation_degrees": float(np.degrees(angle))}
+    return {
+        "position": unit * position,
+        "displacement": unit * displacement,
+        "rotation_degrees": float(np.degrees(angle)),
+    }
 
 
 def _distances(got: Gaussians, expected: Gaussians) -> np.ndarray:

@@ -44,7 +44,7 @@ class WorstGaussians:
 
     t: float
     ids: list[int]  # the worst first
-    center: list[float]  # [3] mean of their float64 means, scene units
+    center: list[float]  # [3] mean of their float64 means, in the world
     spread: float  # their mean distance from it, as a fraction of the scene's half diagonal
     outside_bounds: int
     moved: float  # median distance from their canonical means, as a fraction of the half diagonal

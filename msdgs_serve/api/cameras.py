@@ -17,7 +17,7 @@ def resolve_camera(request: RenderRequest, served: ServedScene) -> Camera:
     """Return the camera and image size of a request. Raises `InvalidInput` naming the field."""
     spec = request.camera
     if isinstance(spec, SceneCamera):
-        camera = _pick(spec, served.session.scene.metadata.cameras).camera
+        camera = _pick(spec, served.metadata.cameras).camera
         return camera.resized(*_size(request, camera.width, camera.height))
     scene = served.framing
     if isinstance(spec, MatrixCamera):

@@ -120,7 +120,7 @@ def _add_keys(document: dict[str, Any]) -> None:
 
 
 def _examples(served: ServedScene, scene: dict[str, str]) -> Examples:
-    frame, metadata = served.framing, served.session.scene.metadata
+    frame, metadata = served.framing, served.metadata
     pose = orbit(frame.target, frame.distance, azimuth=60, elevation=25, up=frame.up)
     t = float(np.clip(round(np.mean(metadata.time_range), 4), *metadata.time_range))
     size = {"width": 400, "height": 400}

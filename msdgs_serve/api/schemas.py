@@ -360,6 +360,13 @@ class GraphCost(BaseModel):
     limits: GraphLimit
 
 
+class Placement(BaseModel):
+    """x_world = scale · x + offset, of a point x in the frame of the scene file's graph."""
+
+    scale: float
+    offset: list[float]
+
+
 class SceneDetail(SceneEntry):
     """Description of a scene."""
 
@@ -372,6 +379,7 @@ class SceneDetail(SceneEntry):
     time_range: tuple[float, float]
     duration: float | None = Field(description="of the time range, seconds, if the scene says so")
     bounds: tuple[list[float], list[float]] = Field(description="two corners of a box, world")
+    scene_to_world: Placement = Field(description="of the file's positions in the world that cameras are in")
     background: tuple[float, float, float] = Field(description="sRGB-encoded")
     antialiasing: str
     eps2d: float = Field(description="px² added to the diagonal of projected covariances")

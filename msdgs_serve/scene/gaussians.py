@@ -1,6 +1,6 @@
 """A set of posed 3D Gaussians with activated parameters, the input of the rasterizer."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,10 @@ class Gaussians:
     @property
     def sh_degree(self) -> int:
         return SH_DEGREES[self.sh.shape[1]]
+
+    def scaled(self, factor: float) -> "Gaussians":
+        """Return the Gaussians in units that are `factor` times as many per length."""
+        return self if factor == 1.0 else replace(self, means=self.means * factor, scales=self.scales * factor)
 
     def validate_shapes(self) -> None:
         """Raise `InvalidInput` naming the array if shapes are inconsistent; values are not checked."""

@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_serve.scene.plain_json import parse
+from msdgs_serve.scene.similarity import IDENTITY, Similarity
 
 CONTRACTS = CONTRACT, CHANGING_CONTRACT = "msdgs/1", "msdgs/2"
 """The second has opacities or SH that depend on time. Files that have neither are of the first."""
@@ -73,14 +74,25 @@ class SceneMetadata:
     checkpoint_sha256: str  # of the model file
     eps2d: float = 0.3  # px², as trained
     duration: float | None = None  # of the time range, seconds; None: unknown
+    scene_to_world: Similarity = IDENTITY  # from the frame of graph, bounds and cameras to the user's world
 
     def to_properties(self) -> dict[str, str]:
         """Return the `metadata_props` of a file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         values["cameras"] = [camera.to_plain() for camera in self.cameras]
+        values["scene_to_world"] = self.scene_to_world.to_plain()
         if self.duration is None:
             del values["duration"]
+        if self.scene_to_world.is_identity:
+            del values["scene_to_world"]
         return {name: json.dumps(value, allow_nan=False) for name, value in values.items()}
+
+    def in_world(self) -> "SceneMetadata":
+        """The same with bounds and cameras in the user's world."""
+        place = self.scene_to_world
+        low, high = (tuple(place.to_world(np.array(corner)).tolist()) for corner in self.bounds)
+        cameras = (replace(each, camera=place.camera_to_world(each.camera)) for each in self.cameras)
+        return replace(self, bounds=(low, high), cameras=tuple(cameras), scene_to_world=IDENTITY)
 
     @classmethod
     def from_properties(cls, properties: Mapping[str, str], file: str) -> "SceneMetadata":
@@ -211,6 +223,12 @@ def _duration(value: Any) -> float:
     return number
 
 
+def _scene_to_world(value: Any) -> Similarity:
+    values = _mapping(value)
+    x, y, z = _numbers(values["offset"], 3)
+    return Similarity(_number(values["scale"]), (x, y, z))
+
+
 def _sha256(value: Any) -> str:
     if not re.fullmatch("[0-9a-f]{64}", _text(value)):
         raise ValueError(f"{_shown(value)} isn't a SHA-256 in lower-case hexadecimal")
@@ -234,4 +252,5 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "checkpoint_sha256": _sha256,
     "eps2d": _eps2d,
     "duration": _duration,
+    "scene_to_world": _scene_to_world,
 }

@@ -11,6 +11,7 @@ from typing import Any, Self
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from msdgs_train.cli.console import console, progress_bar
+from msdgs_train.datasets.common.summary import summary
 from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.run import RunResult
 from msdgs_train.engine.run_record import BEST, MODEL
@@ -50,6 +51,9 @@ class FitProgress(Observer):
             signal.signal(signal.SIGINT, self._old_handler)
 
     def on_train_start(self, trainer: Trainer) -> None:
+        self._print(summary(trainer.scene))
+        for warning in trainer.scene.warnings:
+            self._print(f"warning: {warning}", style="yellow")
         phases = trainer.schedule.phases()
         width = max((len(phase.name) for phase in phases), default=0)
         for phase in phases:

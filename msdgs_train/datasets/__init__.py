@@ -1,5 +1,6 @@
 """Images with cameras and times, read from published dataset layouts: one file per format."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from msdgs_train.datasets.colmap.loader import SPARSE, load_colmap
@@ -33,9 +34,9 @@ def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0) -> 
     folder = Path(path)
     if not folder.is_dir():
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
-    for _, marker, load in LAYOUTS:
+    for layout, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
-            scene = load(folder, size).in_unit_time()
+            scene = replace(load(folder, size), layout=layout).in_unit_time()
             return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
     raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

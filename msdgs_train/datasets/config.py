@@ -20,7 +20,8 @@ class DataConfig(Checked):
     background: Literal["white", "black", "random"] = "white"
     """Color behind the scene; random: another one each step, white in evaluation."""
     scene_half_size: float | None = None
-    """Half the side of the cube around the origin that holds the scene, in scene units; the dataset's if not given."""
+    """Half the side of the cube around its center that holds the scene, in the dataset's units; from points or cameras
+    if not given."""
 
     def __post_init__(self) -> None:
         self.require(

@@ -27,7 +27,7 @@ def load_dnerf(folder: Path, size: int | None = None) -> SceneData:
     entries = {split: _read_split(folder, split) for split in SPLITS}
     check_times([entry for split in SPLITS for entry in entries[split]])
     splits = {split: [_frame(entry, split, size) for entry in entries[split]] for split in SPLITS}
-    return SceneData(splits, SCENE_HALF_SIZE)
+    return SceneData(splits, SCENE_HALF_SIZE, has_nominal_size=True)
 
 
 def _read_split(folder: Path, split: str) -> list[JsonObject]:

@@ -5,7 +5,7 @@ import fcntl
 import json
 import math
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
@@ -102,7 +102,10 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         raise InvalidInput("run", "a new folder, or --resume to continue the run in it", f"{folder}, which holds a run")
     with contextlib.ExitStack() as on_error:
         lock = on_error.enter_context(_locked(folder)) if stored else None
-        trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold))
+        scene = load_scene(data, config.data.size, config.data.llffhold)
+        record = read_record(folder) if stored else None
+        scene = scene.normalized() if record is None else scene.in_frame(record.scene_to_world)
+        trainer = Trainer(config, scene)
         seconds = trainer.load_checkpoint(folder / CHECKPOINT) if stored else 0.0
         if stored:
             require_same_phase(Schedule.from_config(stored), Schedule.from_config(config), trainer.step_count)
@@ -114,7 +117,7 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         best = _best_so_far(folder, trainer.scene) if resume else None
         if best is None:
             (folder / BEST).unlink(missing_ok=True)
-        record = RunRecord(data.absolute(), best)
+        record = RunRecord(data.absolute(), best, scene.scene_to_world)
         write_record(folder, record)
         is_finished = trainer.step_count >= config.run.steps  # its last model is evaluated again
         log = MetricsLog(
@@ -260,7 +263,7 @@ class Run:
         best = self.record.best
         if best is None or candidate.psnr > best.psnr:
             self.trainer.system.save(self.folder / BEST, self.trainer.step_count)
-            self.record = RunRecord(self.record.data, candidate)
+            self.record = replace(self.record, best=candidate)
             write_record(self.folder, self.record)
 
     def _save(self) -> None:

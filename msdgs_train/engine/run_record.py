@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.datasets.common.files import write_text
 from msdgs_train.engine.config import TrainConfig
 
@@ -39,6 +40,7 @@ class RunRecord:
 
     data: Path  # absolute
     best: Best | None = None  # None until a split has been evaluated
+    scene_to_world: Similarity = IDENTITY  # the frame that is trained in
 
 
 def read_record(run: Path) -> RunRecord | None:
@@ -48,14 +50,20 @@ def read_record(run: Path) -> RunRecord | None:
         return None
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
-        return RunRecord(Path(values["data"]), Best(**values["best"]) if values["best"] else None)
+        best = Best(**values["best"]) if values["best"] else None
+        frame = values.get("scene_to_world")  # missing in runs that were started in the frame of the files
+        return RunRecord(Path(values["data"]), best, IDENTITY if frame is None else Similarity.from_plain(frame))
     except (ValueError, KeyError, TypeError) as error:
         raise RunInvalid(path, f"isn't the record of a run: {error}") from None
 
 
 def write_record(run: Path, record: RunRecord) -> None:
     """Write `run.json`, atomically."""
-    values = {"data": str(record.data), "best": asdict(record.best) if record.best else None}
+    values = {
+        "data": str(record.data),
+        "best": asdict(record.best) if record.best else None,
+        "scene_to_world": record.scene_to_world.to_plain(),
+    }
     write_text(run / RECORD, json.dumps(values, indent=2) + "\n")
 
 

@@ -11,6 +11,7 @@ from msdgs_serve import __version__
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
+from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -36,6 +37,13 @@ class SceneInfo:
     """Width in pixels to which images were reduced, as in `DataConfig`."""
     llffhold: int = 0
     """Every so many images were held out, as in `DataConfig`."""
+    scene_to_world: dict[str, Any] = field(default_factory=IDENTITY.to_plain)
+    """Plain values of the `Similarity` from the frame of the model, bounds and cameras to the user's world."""
+
+    @property
+    def placement(self) -> Similarity:
+        """`scene_to_world` as a `Similarity`."""
+        return Similarity.from_plain(self.scene_to_world)
 
 
 class LoadedModel(NamedTuple):
@@ -116,6 +124,10 @@ def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
                 SceneCamera.from_plain(camera)
         except (LookupError, TypeError, ValueError, MsdgsError) as error:
             raise CheckpointInvalid(path, f"scene.{name} holds a camera that can't be used: {error}") from error
+    try:
+        scene.placement  # noqa: B018
+    except (LookupError, TypeError, ValueError, MsdgsError) as error:
+        raise CheckpointInvalid(path, f"scene.scene_to_world can't be used: {error}") from error
     for name in ("size", "llffhold"):
         value = getattr(scene, name)
         if type(value) is not int and (name, value) != ("size", None):

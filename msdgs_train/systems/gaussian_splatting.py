@@ -38,7 +38,8 @@ class GaussianSplatting:
 
     def __init__(self, schedule: Schedule, scene: SceneData) -> None:
         config = schedule.config
-        self.scene_half_size = config.data.scene_half_size or scene.scene_half_size
+        given = config.data.scene_half_size  # in world units
+        self.scene_half_size = given / scene.scene_to_world.scale if given else scene.scene_half_size
         cameras = [frame.camera for frame in scene.splits["train"]]
         distinct = first_by_pose(cameras, lambda camera: camera)
         scale, views = scene_scale(cameras) or self.scene_half_size, len(distinct)
@@ -150,6 +151,7 @@ class GaussianSplatting:
             training_cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in others[len(shown) :]],
             size=self.config.data.size,
             llffhold=self.config.data.llffhold,
+            scene_to_world=self.scene.scene_to_world.to_plain(),
         )
 
     def _options(self, step: int) -> RasterizerOptions:

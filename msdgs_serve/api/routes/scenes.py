@@ -25,6 +25,7 @@ from msdgs_serve.api.openapi import FILE_RESPONSE, NOT_MODIFIED, SCENE_BODY, pro
 from msdgs_serve.api.schemas import (
     GaussianCounts,
     GraphCost,
+    Placement,
     SceneAdded,
     SceneDetail,
     SceneEntry,
@@ -196,10 +197,14 @@ async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
 
 def _describe(store: SceneStore, name: str) -> SceneDetail:
     served, status = store.get(name), store.status(name)
-    scene, metadata, seen = served.session.scene, served.session.scene.metadata, served.framing
+    scene, metadata, seen = served.session.scene, served.metadata, served.framing
     counts = GaussianCounts(moving=scene.moving_count, static=scene.static_count, total=len(scene))
     return SceneDetail(
-        **vars(metadata) | {"cameras": [camera.to_plain() for camera in metadata.cameras]},
+        **vars(metadata)
+        | {
+            "cameras": [camera.to_plain() for camera in metadata.cameras],
+            "scene_to_world": Placement(**scene.metadata.scene_to_world.to_plain()),
+        },
         **_problem(status),
         name=name,
         loaded=status.loaded,

@@ -7,12 +7,28 @@ from pathlib import Path
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.datasets.common.distortion import Distortion, undistort
+from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import read_rgba, resize_area
+from msdgs_train.datasets.common.normalization import are_at_one_place, find_subject, normalization, seen_depths
 
 SPLITS = ("train", "val", "test")
 HELD_OUT = 8
 """Every 8th frame is a test frame if a dataset names none, as in Mip-NeRF 360 and 3D Gaussian Splatting."""
+
+ONE_PLACE = (
+    "all cameras are at one place, which shows no depth, and only views from there will look right: record with a "
+    "camera that moves, or with several"
+)
+UNSEEN_POINTS = (
+    "no camera sees one of the {:,} points, which are left out: give points in the axes and units of the poses, such "
+    "as those of the same COLMAP model"
+)
+UNKNOWN_SIZE = (
+    "the cameras don't look at one point and there are no points, so that the size of the scene is a guess: {:.3g} "
+    "around the cameras; --scene-half-size sets it, and COLMAP's points tell it"
+)
 
 
 @dataclass(frozen=True)
@@ -48,14 +64,63 @@ class Frame:
 
 @dataclass(frozen=True)
 class SceneData:
-    """A dataset ready for training. World axes are those of the dataset; cameras are OpenCV."""
+    """A dataset. Loaders return it in the world that the dataset's files describe, `normalized` in the frame that is
+    trained in. Cameras are OpenCV."""
 
     splits: dict[str, list[Frame]]  # "train" has one frame or more; "val" and "test" may be empty
     scene_half_size: float  # half the side of the cube around the origin that holds the scene, in scene units
-    points: np.ndarray | None = None  # [M, 3] float64, sparse surface points in world axes, scene units
+    points: np.ndarray | None = None  # [M, 3] float64, sparse surface points, scene units
     point_colors: np.ndarray | None = None  # [M, 3] float64 sRGB in [0, 1]; None if `points` have no colors
     unsplit: list[Frame] | None = None  # all frames in their order, if the dataset itself names no splits
     warnings: tuple[str, ...] = ()  # what a user should know about the files, each one sentence with its remedy
+    layout: str = ""  # name of the dataset's layout
+    scene_to_world: Similarity = IDENTITY  # from the frame of cameras and points to that of the files
+    has_nominal_size: bool = False
+    """Whether `scene_half_size` is that of all scenes in this layout, with cameras at `normalization.DISTANCE`."""
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Those of all frames."""
+        return [frame.camera for frames in self.splits.values() for frame in frames]
+
+    def normalized(self) -> "SceneData":
+        """The same scene in the frame that it is trained in, without points that no camera sees."""
+        if not self.scene_to_world.is_identity:
+            return self
+        cameras, points, warnings = self.cameras, self.points, list(self.warnings)
+        if points is not None and not seen_depths(cameras, points):
+            warnings.append(UNSEEN_POINTS.format(len(points)))
+            points = None
+        subject = find_subject(cameras, points)
+        is_guess = points is None and not subject.is_looked_at and subject.distance > 0
+        if is_guess:
+            warnings.append(UNKNOWN_SIZE.format(subject.distance))
+        if are_at_one_place(cameras):
+            warnings.append(ONE_PLACE)
+        scene = replace(self, warnings=tuple(warnings), has_nominal_size=self.has_nominal_size and not is_guess)
+        if points is not self.points:
+            scene = replace(scene, points=None, point_colors=None)
+        if not scene.has_nominal_size:
+            scene = replace(scene, scene_half_size=scene_half_size(points, cameras))
+        return scene.in_frame(normalization(subject))
+
+    def in_frame(self, scene_to_world: Similarity) -> "SceneData":
+        """The same scene in another frame."""
+        own = self.scene_to_world
+        if scene_to_world == own:
+            return self
+
+        def moved(frames: list[Frame]) -> list[Frame]:
+            cameras = (scene_to_world.camera_to_scene(own.camera_to_world(frame.camera)) for frame in frames)
+            return [replace(frame, camera=camera) for frame, camera in zip(frames, cameras, strict=True)]
+
+        points = None if self.points is None else scene_to_world.to_scene(own.to_world(self.points))
+        splits = {split: moved(frames) for split, frames in self.splits.items()}
+        unsplit = None if self.unsplit is None else moved(self.unsplit)
+        scene = replace(self, splits=splits, unsplit=unsplit, points=points, scene_to_world=scene_to_world)
+        return (
+            scene if self.has_nominal_size else replace(scene, scene_half_size=scene_half_size(points, scene.cameras))
+        )
 
     @cached_property
     def time_range(self) -> tuple[float, float]:
