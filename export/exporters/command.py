@@ -29,6 +29,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.metadata import SceneMetadata
 from msdgs_serve.scene.similarity import Similarity
 from msdgs_train.datasets.common.files import replacing, write_text
 
@@ -39,7 +40,7 @@ ONNX, VISIONARY = ".onnx", ".visionary.onnx"
 SINGLE = (".ply", ".spz", ".glb")
 USD = (".usdc", ".usda", ".usd")
 VIDEOS = (".mp4", ".webm")
-OFFSET = "offset.json"
+PLACEMENT = "placement.json"
 """Ending of the file that holds the `Similarity` from the positions of a written file to the world."""
 COMPARED = 5
 """Number of times at which a moving scene is compared."""
@@ -72,32 +73,41 @@ def convert(options: ConvertOptions, console: Console) -> None:
         names = f"{', '.join((*SINGLE, *USD, ONNX))} or {VISIONARY}"
         raise InvalidInput("out", f"a folder (of a name with a dot: an existing one), or named {names}", out.name)
     console.print(f"{out}: {written} against the scene", markup=False)
-    _note_offset(out, session.scene.metadata.scene_to_world, console)
+    _note_placement(out, session.scene.metadata, console)
     eps2d = session.scene.metadata.eps2d
     if eps2d != GSPLAT.eps2d:
         drawn = "blurrier" if eps2d < GSPLAT.eps2d else "sharper"
         console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
 
 
-def _note_offset(out: Path, place: Similarity, console: Console) -> None:
-    """Tell where the world's coordinates of a far scene are kept, and write them beside formats that have no place."""
-    if not any(place.offset) or (out.suffix == ONNX and not out.name.endswith(VISIONARY)):
+def _written_units(file: Path, metadata: SceneMetadata) -> float:
+    """Written units per scene unit: those of the world, but in SPZ and Visionary's model, whose numbers have a range or
+    whose viewer has a near plane for scenes of a few units."""
+    return 1.0 if file.suffix in (".spz", ONNX) else metadata.scene_to_world.scale
+
+
+def _note_placement(out: Path, metadata: SceneMetadata, console: Console) -> None:
+    """Tell where the file lies in the world, and write it beside formats that have no place for it."""
+    place = metadata.scene_to_world
+    left = Similarity(place.scale / _written_units(out, metadata), place.offset)
+    if left.is_identity or (out.suffix == ONNX and not out.name.endswith(VISIONARY)):
         return
-    x, y, z = place.offset
     where = "in the transform of its node"
     if out.suffix not in (*USD, ".glb"):
-        file = out / OFFSET if out.is_dir() else out.with_suffix(f".{OFFSET}")
-        scale = place.scale if out.name.endswith(VISIONARY) else 1.0  # others are in units of the world
-        write_text(file, json.dumps(Similarity(scale, place.offset).to_plain()) + "\n")
-        where = f"which {file} holds"
-    console.print(f"positions are relative to ({x:.12g}, {y:.12g}, {z:.12g}) in the world, {where}", markup=False)
+        file = out / PLACEMENT if out.is_dir() else out.with_suffix(f".{PLACEMENT}")
+        write_text(file, json.dumps(left.to_plain()) + "\n")
+        where = f"in {file}"
+    x, y, z = left.offset
+    console.print(
+        f"x_world = {left.scale:g} x + ({x:.12g}, {y:.12g}, {z:.12g}) of its positions x is {where}", markup=False
+    )
 
 
 def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: float) -> float:
     """Write a file of one time; returns its PSNR against the scene, dB."""
     metadata = session.scene.metadata
-    place = metadata.scene_to_world
-    gaussians = of_the_moment(session.gaussians(t), metadata.plan).scaled(place.scale)
+    place, scale = metadata.scene_to_world, _written_units(file, metadata)
+    gaussians = of_the_moment(session.gaussians(t), metadata.plan).scaled(scale)
     with replacing(file) as temporary:
         if file.suffix == ".spz":
             write_spz(temporary, gaussians, metadata.antialiasing)
@@ -106,7 +116,7 @@ def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: fl
         else:
             write_gltf(temporary, gaussians, framing(metadata).up, place.offset)
         written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
-        psnr = RoundTrip(session).psnr(written, t)
+        psnr = RoundTrip(session).psnr(written.scaled(1 / scale), t)
         require(psnr, options.min_psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
     return psnr
 
@@ -139,10 +149,10 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
         raise InvalidInput("t", "given: frames of this scene are switched, and USD would blend them", "nothing")
     single = metadata.time_range[0] if options.t is None else options.t
     times = _times(session, options) if moves else [single]
-    check = RoundTrip(session)
+    check, scale = RoundTrip(session), _written_units(out, metadata)
 
     def pose(t: float) -> Gaussians:
-        return of_the_moment(session.gaussians(t), metadata.plan).scaled(metadata.scene_to_world.scale)
+        return of_the_moment(session.gaussians(t), metadata.plan).scaled(scale)
 
     with tracked(console) as progress, replacing(out) as temporary:
         on_frame = progress("writing frames", len(times))
@@ -157,7 +167,7 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
         )
         shown = read_usd(temporary)
         compared = np.linspace(0, len(times) - 1, min(COMPARED, len(times))).round().astype(int).tolist()
-        worst = min(check.psnr(shown(number), times[number]) for number in compared)
+        worst = min(check.psnr(shown(number).scaled(1 / scale), times[number]) for number in compared)
         require(worst, options.min_psnr, LOSSLESS, out.name)
     return f"{len(times)} frames, {_megabytes(out)}, {worst:.1f} dB"
 

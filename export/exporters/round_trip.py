@@ -39,9 +39,8 @@ class RoundTrip:
         self._background = metadata.background
 
     def psnr(self, got: Gaussians, t: float) -> float:
-        """PSNR of the worst view, dB, of Gaussians in units of the world; frames are clamped to [0, 1]."""
-        scale = self._session.scene.metadata.scene_to_world.scale
-        both = (got.scaled(1 / scale), self._session.gaussians(t))
+        """PSNR of the worst view, dB, of Gaussians in the scene's frame; frames are clamped to [0, 1]."""
+        both = (got, self._session.gaussians(t))
 
         def frames(camera: Camera) -> list[np.ndarray]:
             return [render(each, camera, self._background, self._options).astype(np.float64) for each in both]
