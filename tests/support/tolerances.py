@@ -23,6 +23,11 @@ TABLE = (
     Row("sh_basis.gsplat", 1e-12, "as sh_basis; gsplat keeps some constants to 14 digits"),
     Row("float32.relative", 1e-6, "a handful of float32 operations"),
     Row("pixel", 1e-9, "projecting a known point through float64 matrices, in pixels"),
+    Row("placed", 1e-9, "coordinates of 5e6 around a scene of size 1 keep 9 digits of it in float64"),
+    Row("pixel.placed", 1e-6, "as placed, times focal lengths of 60 pixels"),
+    Row("normalized.scale", 6e-3, "scales and offsets are rounded to three digits"),
+    Row("normalized.center", 2e-2, "as normalized.scale, for distances of 4"),
+    Row("placed_run_db", 0.5, "scales rounded to three digits move initial Gaussians by up to half a per cent"),
     # 16 numbers at once
     Row("vectors.float32", 3e-5, "some roundings of numbers and sums up to 100; NumPy rounds products first"),
     Row("vectors.float64", 2e-14, "as in float32"),

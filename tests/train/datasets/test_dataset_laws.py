@@ -13,6 +13,7 @@ from msdgs_serve.scene.camera import orbit
 from msdgs_train.datasets import Frame, SceneData, load_scene
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import write_png
+from msdgs_train.datasets.common.normalization import OUTWARD_DISTANCE
 from tests.support.tolerances import assert_close, tolerance
 from tests.train.datasets import layouts
 from tests.train.datasets.layouts import LAYOUTS, Layout, Pose, flat, pose
@@ -137,4 +138,4 @@ def test_parallel_axes_have_no_intersection(count: int):
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = 2.0 * np.arange(count)
     extent = scene_half_size(None, [Camera.from_fov(pose, 20, 10, 40.0) for pose in poses])
-    assert extent == (4.0 if count == 3 else 1.0)
+    assert extent == (2.0 + 2.0 * OUTWARD_DISTANCE if count == 3 else 1.0)
