@@ -32,11 +32,13 @@ PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def visionary_model(scene_file: Path) -> onnx.ModelProto:
-    """The model of a scene file. Raises `InvalidInput` for the plan `int8`, whose graph no browser runs on its GPU."""
+    """The model of a scene file. Raises `InvalidInput` for one with products in 8 bits, as older exporters wrote, which
+    no browser runs on its GPU."""
     scene = DeformationSession(scene_file).scene
     source = onnx.load(scene_file)
     if any(node.op_type in QUANTIZED for node in source.graph.node):
-        raise InvalidInput("scene", "of another plan, for example compact: to_onnx.py --plan compact:65", "int8")
+        plan = scene.metadata.plan
+        raise InvalidInput("scene", "of another plan, for example compact: to_onnx.py --plan compact:65", plan)
     graph = GraphBuilder()
     rows = []
     if scene.moving_count:

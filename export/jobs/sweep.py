@@ -231,7 +231,7 @@ class Sweep:
         model = self.job.pruned(pruning_db).moving
         layers = parse(plan).count or len(model.deformation)
         work = len(model.gaussians) * layers / max(len(self.job.model.gaussians) * len(self.job.model.deformation), 1)
-        expected = self.baseline.cpu_deformation * work / kind.speedup
+        expected = self.baseline.cpu_deformation * work
         if expected < MAX_RELATIVE_COST * fastest.cpu:
             return None
         taken = f"{fastest.candidate.plan} takes {fastest.cpu:.0f} ms for the whole frame"

@@ -47,5 +47,3 @@ class Plan:
     """Whether its size is a number of layers as trained, none of which pruning may then remove."""
     fitted: bool = False
     """Whether it is fitted to float64 trajectories; others run layers for each frame."""
-    speedup: float = 1.0
-    """Speed of its layers relative to float32."""

@@ -8,13 +8,12 @@ import onnx
 from export.jobs.bake import Baked
 from export.plans.base import Plan, PlanSpec
 from export.plans.compact import COMPACT
-from export.plans.int8 import INT8
 from export.plans.network import NETWORK, PREFIX
 from export.plans.scene_graph import static_graph
 from export.trajectories.sampling import Trajectories
 from msdgs_serve.scene.errors import InvalidInput
 
-PLANS: dict[str, Plan] = {plan.name: plan for plan in (NETWORK, PREFIX, INT8, COMPACT)}
+PLANS: dict[str, Plan] = {plan.name: plan for plan in (NETWORK, PREFIX, COMPACT)}
 """By name. `PLANS[plan.name] = plan` adds a plan from outside this package; a sweep then tries its candidates too."""
 
 

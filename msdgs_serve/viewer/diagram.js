@@ -11,7 +11,7 @@ const DB_STEP = 10;
 const MAX_DB = 110; // dB; exact plans are drawn here
 const PLACES = [[1, 1.5, 2, 3, 4, 5, 6, 7, 8], [1, 2, 5], [1]]; // ticks per decade, as many as fit
 const MAX_TICKS = 6;
-const KINDS = ["network", "prefix", "int8", "compact"];
+const KINDS = ["network", "prefix", "compact"];
 
 /** Draw into an <svg>; `tell(text)` is called with a description of the selected point. */
 export function drawDiagram(svg, report, tell) {

@@ -36,6 +36,7 @@ from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.gaussians.model_file import SceneInfo
 from tests.support.models import MLP, NODES, SCENE, random_model
+from tests.support.sound_scenes import OLDER
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
@@ -351,12 +352,16 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
     [
         ("network", "a.mp4", r"msdgs-render"),
         ("network", "a.obj", r"or named .ply, .spz, .glb, .usdc, .usda, .usd, .onnx or .visionary.onnx"),
-        ("int8", "a.visionary.onnx", r"--plan compact:65"),
     ],
 )
 def test_what_cannot_be_written_is_refused_with_an_alternative(tmp_path: Path, plan: str, out: str, message: str):
     with pytest.raises(InvalidInput, match=message):
         run(scene_file(tmp_path, plan), tmp_path / out)
+
+
+def test_products_in_8_bits_of_older_files_are_refused_for_visionary(tmp_path: Path):
+    with pytest.raises(InvalidInput, match=r"--plan compact:65"):
+        run(OLDER / "int8.onnx", tmp_path / "a.visionary.onnx")
 
 
 def test_an_option_without_effect_and_a_missing_folder_are_refused(tmp_path: Path):

@@ -1,6 +1,7 @@
 """Exports of a model that isn't at the origin of the user's world: scene file, reports and other programs' files."""
 
 import dataclasses
+import importlib
 import json
 from io import StringIO
 from pathlib import Path
@@ -86,13 +87,11 @@ def test_gltf_has_it_in_its_node(scene: Path, tmp_path: Path):
 
 
 def test_openusd_has_it_in_its_prim(scene: Path, tmp_path: Path):
-    pxr = pytest.importorskip("pxr.UsdGeom")
-    from pxr import Usd
-
+    usd, geom = (importlib.import_module(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
     converted(scene, tmp_path / "a.usda")
-    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    stage = usd.Stage.Open(str(tmp_path / "a.usda"))
     prim = stage.GetDefaultPrim()
-    matrix = np.array(pxr.Xformable(prim).GetLocalTransformation())
+    matrix = np.array(geom.Xformable(prim).GetLocalTransformation())
     point = np.array(prim.GetAttribute("positions").Get(0)[0], np.float64)
     shown = np.append(point, 1) @ matrix
     up = framing(DeformationSession(scene).scene.metadata).up

@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from export.jobs.bake import Baked, bake
-from export.jobs.write import properties
 from export.layers import HEAD_COLUMNS, LAYERS, ModelNotExportable
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder
@@ -75,21 +74,21 @@ def check_against_model(session: DeformationSession, model: DynamicGaussians, nu
             assert np.abs(got - getattr(expected, name).numpy()).max() <= tolerance("export.relative")
 
 
-@pytest.mark.parametrize("text", ["network", "prefix:3", "int8", "compact:20", "compact:90"])
+@pytest.mark.parametrize("text", ["network", "prefix:3", "compact:20", "compact:90"])
 def test_a_plan_is_its_text(text: str):
     assert str(parse(text)) == text
     assert parse(parse(text)) == parse(text)
 
 
 UNKNOWN = """
-    Network networks network:1 prefix prefix:0 prefix:-1 prefix:1.5 prefix:nan int8:2 compact compact: compact:19
+    Network networks network:1 prefix prefix:0 prefix:-1 prefix:1.5 prefix:nan int8 int8:2 compact compact: compact:19
     compact:91 compact:5e1 compact:inf compact:५० compact:50.5 compact:-50 compact:50:4 lowrank:8 keyframes:9
 """
 
 
 @pytest.mark.parametrize("text", [*UNKNOWN.split(), "", "compact:50 ", "network\n", "a" * 1000])
 def test_an_unknown_plan_is_refused_with_those_that_exist(text: str):
-    with pytest.raises(InvalidInput, match=r"`plan` must be one of: network; prefix:k.*int8; compact:d"):
+    with pytest.raises(InvalidInput, match=r"`plan` must be one of: network; prefix:k.*; compact:d"):
         parse(text)
 
 
@@ -97,8 +96,6 @@ def test_a_plan_that_this_model_cannot_have_says_what_it_can():
     _, baked = made("plane")
     with pytest.raises(InvalidInput, match=r"prefix:k with k from 1 to 1"):
         build("prefix:2", baked)
-    with pytest.raises(InvalidInput, match=r"any but int8"):
-        build("int8", baked)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -132,13 +129,13 @@ def test_distances_in_the_file_are_those_of_a_plain_comparison_with_the_model(tm
     assert worst == pytest.approx(verify(session, model, times=12)["position"], rel=tolerance("float32.relative"))
 
 
-@pytest.mark.parametrize(("plan", "most"), [("network", 2), ("int8", 2), ("prefix:1", 1), ("compact:40", 0)])
+@pytest.mark.parametrize(("plan", "most"), [("network", 2), ("prefix:1", 1), ("compact:40", 0)])
 def test_plans_that_run_layers_can_stop_after_each(tmp_path: Path, plan: str, most: int):
     baked = bake(random_model(60, layers=("mlp", "mlp")), SCENE, "0" * 64)
     assert opened(tmp_path / "scene.onnx", build(plan, baked)).max_steps == most
 
 
-@pytest.mark.parametrize("plan", ["prefix:1", "prefix:2", "int8", "compact:45"])
+@pytest.mark.parametrize("plan", ["prefix:1", "prefix:2", "compact:45"])
 @pytest.mark.parametrize("ids", [[], [7], [59, 0, 5, 5]])
 def test_rows_are_those_asked_for(tmp_path: Path, plan: str, ids: list[int]):
     _, baked = made("mlp")
@@ -157,24 +154,7 @@ def test_prefix_is_the_model_stopped_early_and_network_the_whole_of_it(tmp_path:
         check_against_model(session, model, num_layers)
 
 
-@pytest.mark.parametrize("kind", ["mlp", "mixed", "mlp on nodes", "mixed on nodes"])
-def test_int8_rounds_wide_products_and_nothing_before_them(tmp_path: Path, kind: str):
-    model, baked = made(kind)
-    contents = build("int8", baked)
-    assert properties(contents) == properties(network(baked, "int8"))
-    eight_bits = [c.name for c in contents.graph.initializer if c.data_type == onnx.TensorProto.INT8 and c.dims]
-    assert sorted(n.split("_quantized")[0] for n in eight_bits if "zero" not in n) == [
-        f"layer{k}.trunk{i}.weight" for k, layer in enumerate(baked.layers, 1) if layer.kind == "mlp" for i in (0, 1)
-    ]
-    exact = opened(tmp_path / "exact.onnx", build("network", baked))
-    session = opened(tmp_path / "scene.onnx", contents)
-    moved = np.abs(exact.pose(0.4)[0] - model.gaussians.means.detach().numpy()).max()
-    off = np.abs(session.pose(0.4)[0] - exact.pose(0.4)[0]).max()
-    assert 0 < off < tolerance("int8.relative") * moved
-    assert verify(session, model, times=4)["position"] > 0
-
-
-@pytest.mark.parametrize("plan", ["network", "prefix:1", "int8", "compact:50"])
+@pytest.mark.parametrize("plan", ["network", "prefix:1", "compact:50"])
 def test_a_scene_that_does_not_move_has_no_graph_under_any_plan(tmp_path: Path, plan: str):
     for model in (random_model(5, layers=()), random_model(0)):
         contents = build(plan, bake(model, SCENE, "0" * 64))
@@ -182,13 +162,13 @@ def test_a_scene_that_does_not_move_has_no_graph_under_any_plan(tmp_path: Path, 
         assert opened(tmp_path / "scene.onnx", contents).scene.metadata.plan == plan
 
 
-@pytest.mark.parametrize("plan", ["int8", "compact:30", "compact:70"])
+@pytest.mark.parametrize("plan", ["compact:30", "compact:70"])
 def test_one_gaussian(tmp_path: Path, plan: str):
     model, baked = made("mlp", 1)
     session = opened(tmp_path / "scene.onnx", build(plan, baked, sampled("mlp", 1)))
     assert len(session.gaussians(0.5).validate()) == 1
     visible = np.linalg.norm(np.diff(SCENE.bounds, axis=0)) / 400  # a pixel
-    assert verify(session, model, times=9)["displacement"] < (1 if plan == "int8" else visible)
+    assert verify(session, model, times=9)["displacement"] < visible
 
 
 def test_a_time_range_of_one_time(tmp_path: Path):

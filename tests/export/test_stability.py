@@ -150,7 +150,7 @@ def test_an_unsafe_plan_is_refused_and_an_old_file_stays(tmp_path: Path):
         export_scene(saved(tmp_path, model), output)
     assert output.read_bytes() == b"an older scene"
     report = assess(model, SCENE, times=3)
-    assert all(report.refusal(plan) for plan in ("prefix:3", "int8"))
+    assert all(report.refusal(plan) for plan in ("prefix:3", "network"))
     assert not any(report.refusal(plan) for plan in ("compact:50", "compact:70"))
 
 

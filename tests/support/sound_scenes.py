@@ -24,7 +24,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "static": {"layers": ()},
     **{f"all heads of {kind}": {"layers": (kind,), "opacity_head": True, "sh_head": True} for kind in ("mlp", "plane")},
 }
-PLANS = ("network", "prefix:1", "int8", "compact:40", "compact:60")
+PLANS = ("network", "prefix:1", "compact:40", "compact:60")
 RESOLVED = 1e-4
 """Of the samples of motion: with the exporter's own, sampling takes most of the time, and graphs differ less."""
 
@@ -54,8 +54,7 @@ def _exported() -> Iterator[tuple[str, bytes]]:
         every_plan = config["layers"] and not baked.scene.changing
         trajectories = Trajectories(baked, resolved=RESOLVED) if every_plan else None
         for plan in PLANS if every_plan else PLANS[:1]:
-            if plan != "int8" or "mlp" in config["layers"]:  # other layers have no product of width × width
-                yield f"{name} {plan}", build(plan, baked, trajectories).SerializeToString()
+            yield f"{name} {plan}", build(plan, baked, trajectories).SerializeToString()
 
 
 def _packed() -> Iterator[tuple[str, bytes]]:

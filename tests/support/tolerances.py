@@ -90,7 +90,6 @@ TABLE = (
     Row("visible_error.relative", 0.1, "means over 257 times, not 1,025, of motion up to the Nyquist rate of either"),
     Row("compact.predicted", 7.0, "dB; errors are taken as independent; those of 12 nodes' followers aren't"),
     Row("compact.pose", 5e-3, "scene units of motion of size 1; what is left of 90 dB in hardly visible Gaussians"),
-    Row("int8.relative", 0.3, "of the largest motion; 8 bits are 0.4 % of a range, layers multiply it, AVX2 saturates"),
     Row("fast_motion", 0.05, "scene units of a motion of 1; 513 samples are 8 a period of the fastest one tested"),
     Row("spline_fit", 1e-9, "a pseudo-inverse of a well-conditioned band of up to 129 rows, float64"),
     Row("browser_camera", 1e-5, "entries of a pose near 4; through orbit controls and messages of a page in float32"),
