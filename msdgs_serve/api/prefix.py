@@ -68,7 +68,8 @@ class BehindProxy(ProxyHeadersMiddleware):
 def _prepend(prefix: str, scope: Scope) -> None:
     """Put the prefix before the path, as ASGI has it. A proxy may have left it there, but our own paths come first."""
     path, left = scope["path"], unquote(prefix)
-    if f"{path}/".startswith(f"{left}/") and not methods_at(scope):
+    is_left = f"{path}/".startswith(f"{left}/")
+    if is_left and not any(methods_at({**scope, "path": ours}) for ours in (path, left)):
         path = path.removeprefix(left)
     scope["path"] = prefix + path
     scope["root_path"] = prefix + scope.get("root_path", "")
