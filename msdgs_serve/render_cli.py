@@ -31,7 +31,7 @@ from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
 from msdgs_serve.scene import InvalidInput, MsdgsError
-from msdgs_serve.video import VIDEO_FORMATS, VideoFormat, check_size, require_pyav, write_video
+from msdgs_serve.video import PIXELS, VIDEO_FORMATS, VideoFormat, check_size, pixels_of, require_pyav, write_video
 
 PROGRAM = "msdgs-render"
 USAGE_ERROR = 2
@@ -129,6 +129,8 @@ def _run(options: argparse.Namespace) -> None:
         os.replace(unfinished, options.out)
         shutil.rmtree(folder)
     print(f"wrote {options.out}: {len(files)} frames of {first.width} × {first.height}")
+    if is_video and pixels_of(cast(VideoFormat, video), first.width, first.height) != PIXELS:
+        print("Some players, such as QuickTime, show MP4 of even sizes only; .webm and .webp have any size.")
 
 
 def _views(options: argparse.Namespace) -> tuple[list[View], float]:
