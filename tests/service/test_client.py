@@ -87,20 +87,31 @@ def test_numbers_of_numpy_are_those_of_python(client: Client, dtype: type):
     for t in (dtype(1), np.array(1, dtype), Fraction(1), Decimal("1.0")):
         frame = client.render(camera, t, width=np.int64(16), height=np.array(12, np.uint8), scene=np.str_("balls"))  # pyright: ignore[reportArgumentType]
         np.testing.assert_array_equal(frame.rgb, expected.rgb)  # pyright: ignore[reportArgumentType]
-    pose = np.round(level_camera().camera_to_world).astype(np.int8).astype(dtype) if dtype != np.uint64 else np.eye(4)
-    matrix = Matrix(pose, fx=dtype(40), model="fisheye", distortion=np.zeros(4, dtype))
-    plain = Matrix(pose.astype(float).tolist(), fx=40, model="fisheye", distortion=[0, 0, 0, 0])
-    sent = {
-        "width": np.int16(16),
-        "height": np.int32(12),
-        "background": np.array([1, 0, 1], dtype),
-        "quality": dtype(7),
-    }
-    assert json.dumps(
-        request_body(matrix, dtype(1), **sent, dt=dtype(1), shutter=Shutter(dtype(0), dtype(1), np.int8(3)))
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble, np.int8, np.uint64])
+def test_every_field_of_a_body_may_be_of_numpy(client: Client, dtype: type):
+    one, vector = dtype(1), np.array([0, 0, 4], dtype)
+    camera = Matrix(
+        np.eye(4, dtype=dtype), fx=one, fy=one, cx=one, cy=one, model="fisheye", distortion=np.zeros(4, dtype)
     )
-    client.render(matrix, dtype(1), channels=np.array(["rgb", "motion"]), dt=np.array(0, dtype), width=16, height=12)  # pyright: ignore[reportArgumentType]
-    assert request_body(matrix, dtype(1)) == request_body(plain, 1)
+    channels: Any = np.array(["rgb", "motion"])
+    body = request_body(
+        camera, one, width=np.int16(16), height=np.int32(12), quality=np.uint8(7), background=(one, dtype(0), one),
+        shutter=Shutter(dtype(0), one, np.int8(3)), dt=one, steps=one, channels=channels,
+    )  # fmt: skip
+    plain = {
+        "camera": {
+            "type": "matrix", "camera_to_world": np.eye(4).tolist(), "axes": "opencv", "fx": 1, "fy": 1, "cx": 1,
+            "cy": 1, "model": "fisheye", "distortion": [0, 0, 0, 0],
+        },
+        "t": 1, "width": 16, "height": 12, "format": "png", "quality": 7, "channels": ["rgb", "motion"],
+        "background": [1, 0, 1], "dt": 1, "steps": 1, "shutter": {"open": 0, "close": 1, "samples": 3},
+    }  # fmt: skip
+    assert json.loads(json.dumps(body)) == plain
+    seen = client.render(LookAt(vector, vector * 0, np.array([0, 1, 0], dtype), dtype(40)), one, width=16, height=12)
+    by_python = client.render(LookAt([0, 0, 4], [0, 0, 0], [0, 1, 0], 40), 1, width=16, height=12)
+    np.testing.assert_array_equal(seen.rgb, by_python.rgb)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(
