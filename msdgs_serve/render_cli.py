@@ -59,8 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"\n{PROGRAM}: stopped; the same command continues from here", file=sys.stderr)
         return INTERRUPTED
-    except (MsdgsError, OSError) as error:
+    except MsdgsError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    except OSError as error:
+        print(f"{PROGRAM}: {error.filename or options.out}: {error.strerror or 'not readable'}", file=sys.stderr)
         return USAGE_ERROR
     return 0
 
@@ -102,7 +105,7 @@ def _run(options: argparse.Namespace) -> None:
             names = " or ".join(f".{name}" for name in VIDEO_FORMATS)
             expected = f"a folder (of a name with a dot: an existing one), or a video named {names}"
             raise InvalidInput("OUT", expected, options.out.name)
-        require_pyav()
+        require_pyav(cast(VideoFormat, video))
     views, fps = _views(options)
     image_format = cast(ImageFormat, "png" if is_video else options.format)
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)

@@ -58,15 +58,18 @@ MUXER_OPTIONS: dict[VideoFormat, dict[str, str]] = {
 
 
 class VideoUnavailable(MsdgsError):
-    """PyAV is not installed."""
+    """PyAV or one of its encoders is not installed."""
 
 
-def require_pyav() -> None:
-    """Raise `VideoUnavailable` without PyAV."""
+def require_pyav(video_format: VideoFormat) -> None:
+    """Raise `VideoUnavailable` without PyAV, an optional dependency, or without the format's encoder in it."""
     try:
-        import av  # noqa: F401  # an optional dependency
+        import av
     except ImportError:
         raise VideoUnavailable("videos need PyAV: pip install 'msdgs[video]'") from None
+    codec = VIDEO_FORMATS[video_format].codec
+    if codec not in av.codecs_available:
+        raise VideoUnavailable(f"{video_format} needs {codec}, which this build of PyAV lacks, unlike that of PyPI")
 
 
 def check_size(video_format: VideoFormat, width: int, height: int) -> None:

@@ -3,7 +3,7 @@
 import itertools
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
 from urllib.parse import quote
@@ -216,11 +216,9 @@ def _with_other_slash(request: Request) -> str | None:
     return prefix + quote(other.removeprefix(prefix)) + (f"?{query}" if query else "")
 
 
-def _field_error(item: dict[str, Any]) -> FieldError:
+def _field_error(item: Mapping[str, Any]) -> FieldError:
     """Return one of pydantic's errors, without its input, which may be large or not representable in JSON."""
-    field, message = _field_name(item["loc"]), item["msg"]
-    if item["type"] in MESSAGES:
-        message = MESSAGES[item["type"]].format(**item.get("ctx", {}))
+    field, message = _field_name(item["loc"]), message_of(item)
     if field == "body":
         message = NOT_JSON
     if item["type"] in ("union_tag_invalid", "union_tag_not_found"):
@@ -228,6 +226,11 @@ def _field_error(item: dict[str, Any]) -> FieldError:
         if tags := item.get("ctx", {}).get("expected_tags"):
             message = f"must be one of {tags}"
     return FieldError(field=field, message=message)
+
+
+def message_of(item: Mapping[str, Any]) -> str:
+    """Return the text of one of pydantic's errors."""
+    return MESSAGES[item["type"]].format(**item.get("ctx", {})) if item["type"] in MESSAGES else item["msg"]
 
 
 def _field_name(location: Sequence[str | int]) -> str:

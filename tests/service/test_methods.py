@@ -109,21 +109,3 @@ def test_an_address_with_a_slash_too_many_leads_to_the_one_without(client: httpx
     for path in ("//evil.example/", "//evil.example", "/%2Fevil.example/", "/static-offline-docs/nothing/", "//"):
         check_problem(client.get(httpx.URL(f"{client.base_url}").copy_with(raw_path=path.encode())), 404)
     assert client.post("/scenes/").status_code == 307
-
-
-@pytest.mark.parametrize(
-    "coding", ["gzip", "deflate", "br", "zstd", "gzip, br", "identity, gzip", "x-gzip", "what", "GZIP"]
-)
-def test_a_compressed_body_is_refused(client: httpx.Client, coding: str):
-    for path in ("/render", "/render/batch", "/render/video", "/scenes?name=new"):
-        response = client.post(path, content=b"\x1f\x8b\x08", headers={"Content-Encoding": coding})
-        check_problem(response, 415, "body")
-        assert coding.rpartition("identity, ")[2] in response.json()["detail"]
-        assert response.headers["Accept-Encoding"] == "identity"
-    assert client.post("/render", content=iter([b"\x1f"] * 3), headers={"Content-Encoding": coding}).status_code == 415
-
-
-@pytest.mark.parametrize("coding", ["identity", "Identity", "", "identity, identity"])
-def test_a_body_as_it_is_needs_no_coding(client: httpx.Client, coding: str):
-    body = {"camera": {"type": "orbit", "azimuth": 0, "elevation": 0}, "t": 0.0, "width": 8, "height": 8}
-    assert client.post("/render", json=body, headers={"Content-Encoding": coding}).status_code == 200

@@ -37,7 +37,7 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
 
     For long videos use `msdgs-render` on the machine itself, which shows its progress and can be resumed.
     """
-    require_pyav()
+    require_pyav(body.format)
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
     stream = _stream_video(service, body, scene, path)
     first = await unless_gone(request, anext(stream))  # an error in the first frame still gets its status
