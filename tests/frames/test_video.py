@@ -295,6 +295,17 @@ def test_errors_are_one_line(
     assert not list(Path().glob("*.frames")), "before frames are drawn"
 
 
+@pytest.mark.parametrize(
+    ("out", "reason"), [("file", "file: File exists"), ("file/turn.mp4", "file/turn.mp4.frames: Not a directory")]
+)
+def test_a_file_in_the_way_is_named(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, reason: str
+):
+    (tmp_path / "file").touch()
+    assert run(scene, tmp_path / out, "--frames", 1) == 2
+    assert capsys.readouterr().err == f"msdgs-render: {tmp_path}/{reason}\n"
+
+
 def test_a_folder_may_have_a_dot_in_its_name(scene: Path, tmp_path: Path):
     (tmp_path / "shot.v2").mkdir()
     assert run(scene, tmp_path / "shot.v2", "--frames", 1, "--width", 8, "--height", 8) == 0
