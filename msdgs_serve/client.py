@@ -314,6 +314,8 @@ def _plain_numbers(value: Any, at: str) -> Any:
     """Return a number, or those of an array or a tensor; an array of texts too."""
     try:
         array = np.asarray(value)
+        if np.ma.is_masked(value):
+            raise TypeError
         if array.dtype.kind not in "biuU":
             if array.dtype.kind not in "fO":  # O: such as Python's fractions
                 raise TypeError

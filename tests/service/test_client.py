@@ -135,7 +135,7 @@ def test_a_list_of_times_gives_arrays_of_as_many_frames(client: Client, times: A
 NO_NUMBERS = [
     float("nan"), -float("inf"), np.float32("nan"), np.array(np.inf), [0.0, np.nan], np.array([0.0, -np.inf]), 1j,
     np.complex64(1), np.datetime64("2026-01-01"), object(), {0.5}, b"0.5", (t for t in [0.5]), 10**5000,
-    [None, object()], np.longdouble("1e400"), Decimal("NaN"), np.array([object()]), [[0.5], {1}],
+    [None, object()], np.longdouble("1e400"), Decimal("NaN"), np.ma.masked, np.array([object()]), [[0.5], {1}],
 ]  # fmt: skip
 
 
