@@ -4,7 +4,7 @@
         frame = client.render(Orbit(azimuth=30, elevation=20), t=0.5, width=400, height=400)
         frame.rgb, frame.alpha, frame.depth
 
-ClientError
+ClientError         also a value that can't be sent, such as NaN, or an answer of something else than the service
 ├── Problem         the service answered with an error: `status`, `detail` and `errors` by field
 └── Unreachable     there was no answer
 """
@@ -31,9 +31,13 @@ Format = Literal["png", "jpeg", "webp", "exr", "npy"]
 Color = tuple[float, float, float]
 Background = Color | Literal["auto", "scene", "transparent"]
 FloatArray = npt.NDArray[np.floating]
+Real = float | np.floating | np.integer
+Whole = int | np.integer
+Time = Real | Sequence[Real] | npt.NDArray[Any]
+Vector = Sequence[Real] | npt.NDArray[Any]
 
 DEFAULT_CHANNELS: tuple[Channel, ...] = ("rgb", "alpha", "depth")
-WIDTHS: dict[str, int] = {"rgb": 3, "alpha": 1, "depth": 1, "motion": 2, "gaussians": 1}
+WIDTHS: dict[Channel, int] = {"rgb": 3, "alpha": 1, "depth": 1, "motion": 2, "gaussians": 1}
 DEFAULT_SECONDS = 60.0
 TRIES = 4
 OVERLOADED = 503
@@ -61,12 +65,12 @@ class Problem(ClientError):
 class Orbit:
     """A camera on a sphere around `target`. Angles in degrees; the scene has defaults for None."""
 
-    azimuth: float
-    elevation: float
-    distance: float | None = None
-    target: Sequence[float] | None = None  # [3] world
-    up: Sequence[float] | None = None  # [3] world
-    fov_y: float | None = None  # vertical, degrees
+    azimuth: Real
+    elevation: Real
+    distance: Real | None = None
+    target: Vector | None = None  # [3] world
+    up: Vector | None = None  # [3] world
+    fov_y: Real | None = None  # vertical, degrees
     type: str = field(default="orbit", init=False)
 
 
@@ -74,10 +78,10 @@ class Orbit:
 class LookAt:
     """A camera at `eye` that looks at `target`."""
 
-    eye: Sequence[float]  # [3] world
-    target: Sequence[float] | None = None
-    up: Sequence[float] | None = None
-    fov_y: float | None = None
+    eye: Vector  # [3] world
+    target: Vector | None = None
+    up: Vector | None = None
+    fov_y: Real | None = None
     type: str = field(default="look_at", init=False)
 
 
@@ -90,13 +94,13 @@ class Matrix:
 
     camera_to_world: npt.ArrayLike  # [4, 4]
     axes: Literal["opencv", "opengl"] = "opencv"
-    fov_y: float | None = None
-    fx: float | None = None
-    fy: float | None = None
-    cx: float | None = None
-    cy: float | None = None
+    fov_y: Real | None = None
+    fx: Real | None = None
+    fy: Real | None = None
+    cx: Real | None = None
+    cy: Real | None = None
     model: Literal["pinhole", "orthographic", "fisheye"] = "pinhole"
-    distortion: Sequence[float] | None = None
+    distortion: Vector | None = None
     type: str = field(default="matrix", init=False)
 
 
@@ -105,7 +109,7 @@ class SceneCamera:
     """A camera that is stored in the scene, by `name` or `index`."""
 
     name: str | None = None
-    index: int | None = None
+    index: Whole | None = None
     type: str = field(default="scene", init=False)
 
 
@@ -116,14 +120,17 @@ Camera = Orbit | LookAt | Matrix | SceneCamera
 class Shutter:
     """Motion blur from `t + open` to `t + close`."""
 
-    open: float
-    close: float
-    samples: int = 8
+    open: Real
+    close: Real
+    samples: Whole = 8
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A rendered frame as float32 arrays; channels that were not requested are None."""
+    """A rendered frame as float32 arrays; channels that were not requested are None.
+
+    Of a list of T times, each array has T as its first dimension.
+    """
 
     rgb: FloatArray | None  # [H, W, 3] sRGB-encoded; premultiplied by alpha if the background is transparent
     alpha: FloatArray | None  # [H, W] coverage by Gaussians, also where a background is behind them
@@ -167,29 +174,29 @@ class Client:
     def render(
         self,
         camera: Camera,
-        t: float,
+        t: Time,
         *,
         scene: str | None = None,
-        width: int | None = None,
-        height: int | None = None,
+        width: Whole | None = None,
+        height: Whole | None = None,
         channels: Sequence[Channel] = DEFAULT_CHANNELS,
         background: Background = "auto",
         shutter: Shutter | None = None,
-        dt: float | None = None,
-        steps: float | None = None,
+        dt: Real | None = None,
+        steps: Real | None = None,
     ) -> Frame:
-        """Return a frame as arrays. The channel `motion` needs `dt`, in scene time; `steps` is the number of the
-        scene's layers that are applied. Raises `Problem` or `Unreachable`."""
+        """Return a frame as arrays, for a list of times with all of them. The channel `motion` needs `dt`, in scene
+        time; `steps` is the number of the scene's layers that are applied. Raises `ClientError`."""
         body = request_body(
             camera, t, scene=scene, width=width, height=height, channels=channels, background=background,
             shutter=shutter, dt=dt, steps=steps, format="npy",
         )  # fmt: skip
         response = self._call("POST", "/render", json=body)
-        pixels = _array(response.content)
+        pixels = _array(response)
         return _frame(pixels, channels, response.headers)
 
-    def render_file(self, camera: Camera, t: float, *, format: Format = "png", **options: Any) -> bytes:
-        """Return a frame as an image file; `options` are those of `request_body`."""
+    def render_file(self, camera: Camera, t: Time, *, format: Format = "png", **options: Any) -> bytes:
+        """Return a frame as an image file, for a list of times a ZIP of them; `options` are those of `request_body`."""
         return self._call("POST", "/render", json=request_body(camera, t, format=format, **options)).content
 
     def render_many(self, bodies: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, bytes | Problem]]:
@@ -197,7 +204,7 @@ class Client:
 
         A frame that fails yields a `Problem`; the others are drawn.
         """
-        frames = [dict(body) for body in bodies]
+        frames = [_plain(body, f"frames.{number}") for number, body in enumerate(bodies)]
         with self._connected(), self._http.stream("POST", "/render/batch", json={"frames": frames}) as response:
             if response.is_error:
                 response.read()
@@ -257,39 +264,74 @@ class Client:
 
 def request_body(
     camera: Camera,
-    t: float | Sequence[float],
+    t: Time,
     *,
     scene: str | None = None,
-    width: int | None = None,
-    height: int | None = None,
+    width: Whole | None = None,
+    height: Whole | None = None,
     format: Format = "png",
-    quality: int | None = None,
+    quality: Whole | None = None,
     channels: Sequence[Channel] | None = None,
     background: Background = "auto",
     shutter: Shutter | None = None,
-    dt: float | None = None,
-    steps: float | None = None,
+    dt: Real | None = None,
+    steps: Real | None = None,
 ) -> dict[str, Any]:
-    """Return the JSON body of `POST /render`; None is left out."""
+    """Return the JSON body of `POST /render`; None is left out. Raises `ClientError` for what JSON can't hold."""
     values = {
-        "scene": scene, "camera": _plain(camera), "t": t, "width": width, "height": height, "format": format,
-        "quality": quality, "channels": None if channels is None else list(channels), "background": background,
-        "dt": dt, "steps": steps, "shutter": None if shutter is None else _plain(shutter),
+        "scene": scene, "camera": camera, "t": t, "width": width, "height": height, "format": format,
+        "quality": quality, "channels": channels, "background": background, "dt": dt, "steps": steps,
+        "shutter": shutter,
     }  # fmt: skip
+    return _plain(_given(values), "")
+
+
+def _given(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _plain(value: Camera | Shutter) -> dict[str, Any]:
-    plain = {each.name: getattr(value, each.name) for each in fields(value)}
-    for name, each in plain.items():
-        if each is not None and not isinstance(each, str | int | float):
-            plain[name] = np.asarray(each, dtype=np.float64).tolist()
-    return {name: each for name, each in plain.items() if each is not None}
+def _plain(value: Any, at: str) -> Any:
+    """Return a value as JSON holds it: numbers and arrays of NumPy as Python's."""
+    if value is None:
+        return None
+    if isinstance(value, Camera | Shutter):
+        value = _given({each.name: getattr(value, each.name) for each in fields(value)})
+    if isinstance(value, Mapping):
+        return {name: _plain(each, f"{at}.{name}".lstrip(".")) for name, each in value.items()}
+    if isinstance(value, list | tuple | range):
+        return [_plain(each, f"{at}.{number}") for number, each in enumerate(value)]
+    return _plain_text(value, at) if isinstance(value, str) else _plain_numbers(value, at)
+
+
+def _plain_text(text: str, at: str) -> str:
+    try:
+        return text.encode().decode()
+    except UnicodeEncodeError:
+        raise ClientError(f"`{at}` must be text that UTF-8 can hold, got {text!a}") from None
+
+
+def _plain_numbers(value: Any, at: str) -> Any:
+    """Return a number, or those of an array or a tensor; an array of texts too."""
+    try:
+        array = np.asarray(value)
+        if np.ma.is_masked(value):
+            raise TypeError
+        if array.dtype.kind not in "biuU":
+            if array.dtype.kind not in "fO":  # O: such as Python's fractions
+                raise TypeError
+            with np.errstate(over="ignore"):
+                array = array.astype(np.float64)
+            if not np.isfinite(array).all():
+                raise TypeError
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last: of tensors
+        got = value if isinstance(value, float | np.floating) else f"another {type(value).__name__}"
+        raise ClientError(f"`{at}` must be a finite number or an array of them, got {got}") from None
+    return array.tolist()
 
 
 def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Headers) -> Frame:
     edges = np.cumsum([WIDTHS[channel] for channel in channels])[:-1]
-    parts = dict(zip(channels, np.split(pixels, edges, axis=2), strict=True))
+    parts = dict(zip(channels, np.split(pixels, edges, axis=-1), strict=True))
     found = {name: part if WIDTHS[name] > 1 else part[..., 0] for name, part in parts.items()}
     durations = re.findall(r'([\w-]+)[^,]*?; *dur="?(\d+\.?\d*)', headers.get("Server-Timing", ""))
     milliseconds = {name: float(duration) for name, duration in durations}
@@ -297,8 +339,12 @@ def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Heade
     return Frame(**drawn, plan=headers.get("Msdgs-Plan", ""), milliseconds=milliseconds)
 
 
-def _array(content: bytes) -> np.ndarray:
-    return np.load(io.BytesIO(content), allow_pickle=False)
+def _array(response: httpx.Response) -> np.ndarray:
+    try:
+        return np.lib.format.read_array(io.BytesIO(response.content), allow_pickle=False)
+    except ValueError:
+        kind = response.headers.get("Content-Type", "without a type")
+        raise ClientError(f"{response.url}: the answer is no array of pixels, but {kind}") from None
 
 
 def _problem(response: httpx.Response) -> Problem:

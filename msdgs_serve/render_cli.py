@@ -31,7 +31,7 @@ from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
 from msdgs_serve.scene import InvalidInput, MsdgsError
-from msdgs_serve.video import VIDEO_FORMATS, VideoFormat, check_size, require_pyav, write_video
+from msdgs_serve.video import PIXELS, VIDEO_FORMATS, VideoFormat, check_size, pixels_of, require_pyav, write_video
 
 PROGRAM = "msdgs-render"
 USAGE_ERROR = 2
@@ -59,8 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"\n{PROGRAM}: stopped; the same command continues from here", file=sys.stderr)
         return INTERRUPTED
-    except (MsdgsError, OSError) as error:
+    except MsdgsError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
+        return USAGE_ERROR
+    except OSError as error:
+        print(f"{PROGRAM}: {error.filename or options.out}: {error.strerror or 'not readable'}", file=sys.stderr)
         return USAGE_ERROR
     return 0
 
@@ -102,7 +105,7 @@ def _run(options: argparse.Namespace) -> None:
             names = " or ".join(f".{name}" for name in VIDEO_FORMATS)
             expected = f"a folder (of a name with a dot: an existing one), or a video named {names}"
             raise InvalidInput("OUT", expected, options.out.name)
-        require_pyav()
+        require_pyav(cast(VideoFormat, video))
     views, fps = _views(options)
     image_format = cast(ImageFormat, "png" if is_video else options.format)
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
@@ -129,6 +132,8 @@ def _run(options: argparse.Namespace) -> None:
         os.replace(unfinished, options.out)
         shutil.rmtree(folder)
     print(f"wrote {options.out}: {len(files)} frames of {first.width} × {first.height}")
+    if is_video and pixels_of(cast(VideoFormat, video), first.width, first.height) != PIXELS:
+        print("Some players, such as QuickTime, show MP4 of even sizes only; .webm and .webp have any size.")
 
 
 def _views(options: argparse.Namespace) -> tuple[list[View], float]:

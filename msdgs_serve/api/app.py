@@ -10,8 +10,10 @@ from msdgs_serve.api.admission import Admission
 from msdgs_serve.api.body_limit import BodyLimit
 from msdgs_serve.api.errors import install_error_handlers
 from msdgs_serve.api.keys import KeyCheck, read_keys
+from msdgs_serve.api.methods import Head
 from msdgs_serve.api.observe import REQUEST_ID, Observe
 from msdgs_serve.api.openapi import install_openapi
+from msdgs_serve.api.prefix import BehindProxy
 from msdgs_serve.api.routes import batch, health, render, scenes, video, viewer
 from msdgs_serve.api.service import Service
 from msdgs_serve.api.settings import Settings
@@ -39,7 +41,13 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
         raise InvalidInput("uploads", "given with a folder, to which scenes are added", "only files")
     keys = None if settings.api_keys_file is None else read_keys(settings.api_keys_file)
     service = Service(store, renderer, settings)
-    app = FastAPIOffline(title="msdgs", version=__version__, description=DESCRIPTION, lifespan=service.lifespan)
+    app = FastAPIOffline(
+        title="msdgs",
+        version=__version__,
+        description=DESCRIPTION,
+        lifespan=service.lifespan,
+        redirect_slashes=False,  # see msdgs_serve.api.errors
+    )
     app.state.service = service
     for calls in (render, batch, video, scenes, health, viewer):
         app.include_router(calls.router)
@@ -66,5 +74,7 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
             allow_headers=["*"],
             expose_headers=EXPOSED_HEADERS,
         )
+    app.add_middleware(Head)
     app.add_middleware(Observe, service.metrics)
+    app.add_middleware(BehindProxy, settings.proxies, settings.root_path)
     return app

@@ -1,4 +1,4 @@
-"""Reject request bodies that are too large or too slow, without keeping them in memory."""
+"""Reject request bodies that are too large, too slow or compressed, without keeping them in memory."""
 
 import asyncio
 from collections.abc import Collection
@@ -12,9 +12,15 @@ from msdgs_serve.api.prefix import route_path
 DRAINED_BYTES = 64 << 20
 """Bytes of a body that is too large to read and discard: most clients read the response only after sending."""
 
+HEADERS = {
+    HTTPStatus.REQUEST_TIMEOUT: {"Connection": "close"},
+    HTTPStatus.UNSUPPORTED_MEDIA_TYPE: {"Accept-Encoding": "identity"},
+}
+
 
 class BodyLimit:
-    """ASGI middleware: 413 for a body of more than `max_bytes`, 408 for one that takes longer than `seconds`.
+    """ASGI middleware: 413 for a body of more than `max_bytes`, 408 for one that takes longer than `seconds`, 415 for
+    one with a content coding.
 
     Routes in `streamed`, as (method, path), read their bodies themselves, with limits of their own.
     """
@@ -28,6 +34,10 @@ class BodyLimit:
         self._streamed = streamed
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] == "http" and scope["method"] == "POST" and (codings := _codings(scope)):
+            message = f"must be sent without Content-Encoding, got {codings}"
+            await _reject(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, message, "encoded_body", scope, receive, send)
+            return
         if scope["type"] != "http" or (scope["method"], route_path(scope)) in self._streamed:
             await self._app(scope, receive, send)
             return
@@ -66,8 +76,14 @@ class BodyLimit:
 async def _reject(status: HTTPStatus, message: str, kind: str, scope: Scope, receive: Receive, send: Send) -> None:
     scope[KIND] = kind
     errors = [FieldError(field="body", message=message)]
-    headers = {"Connection": "close"} if status == HTTPStatus.REQUEST_TIMEOUT else None
-    await problem_response(status, f"The body {message}.", errors, headers)(scope, receive, send)
+    await problem_response(status, f"The body {message}.", errors, HEADERS.get(status))(scope, receive, send)
+
+
+def _codings(scope: Scope) -> str:
+    """Return the content codings of a body but `identity`, joined by commas."""
+    given = b",".join(value for name, value in scope["headers"] if name == b"content-encoding").decode("latin-1")
+    codings = (each.strip() for each in given.split(","))
+    return ", ".join(each for each in codings if each.lower() not in ("", "identity"))
 
 
 def _replay(body: bytes, receive: Receive) -> Receive:

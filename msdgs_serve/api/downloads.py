@@ -10,6 +10,7 @@ import zstandard
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from msdgs_serve.api.methods import ONLY_HEAD
 from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.store import SUFFIX, SceneContents
 
@@ -40,6 +41,8 @@ class SceneFileResponse(StreamingResponse):
         super().__init__(self._pieces(), media_type=MEDIA_TYPE, headers=headers)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if ONLY_HEAD in scope:
+            self._left = 0
         with self._contents.file:
             await super().__call__(scope, receive, send)
 

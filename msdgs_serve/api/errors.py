@@ -3,16 +3,18 @@
 import itertools
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from http import HTTPStatus
 from typing import Any
+from urllib.parse import quote
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import Response
+from fastapi.responses import RedirectResponse, Response
 from pydantic import BaseModel, Field, ValidationError
 from starlette.exceptions import HTTPException
 
+from msdgs_serve.api.methods import methods_at
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
 from msdgs_serve.store import SceneExists
 from msdgs_serve.video import VideoUnavailable
@@ -32,6 +34,20 @@ CLIENT_CLOSED_REQUEST = 499  # as in nginx
 UNIONS = ("camera", "background", "t")
 MEMBERS = ("orbit", "look_at", "matrix", "scene", "name", "color", "one", "list")
 """Members of unions: pydantic appends the one that it tried to the field's location."""
+
+NOT_JSON = "must be a JSON object in UTF-8, sent as content-type: application/json"
+MESSAGES = {
+    "missing": "must be given",
+    "extra_forbidden": "isn't a field here; /docs lists those that are",
+    "model_type": "must be an object",
+    "model_attributes_type": "must be an object",
+    "dict_type": "must be an object",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "too_short": "must be a list of {min_length} or more, got {actual_length}",
+    "too_long": "must be a list of at most {max_length}, got {actual_length}",
+}
+"""Messages by pydantic's types of errors, where its own are in terms of Python."""
 
 MEDIA_TYPE = "application/problem+json"
 MAX_BODY_BYTES = 8192
@@ -164,24 +180,57 @@ def _invalid(items: Sequence[Any]) -> Response:
     return problem_response(HTTPStatus.UNPROCESSABLE_ENTITY, detail, errors)
 
 
-async def _on_http_error(_: Request, error: Exception) -> Response:
+async def _on_http_error(request: Request, error: Exception) -> Response:
+    """Answer what routing raises, and FastAPI for a body that it can't parse."""
     assert isinstance(error, HTTPException)
-    errors = []
-    if error.status_code == HTTPStatus.BAD_REQUEST:  # raised by FastAPI for a body that isn't valid JSON
-        errors.append(FieldError(field="body", message=str(error.detail)))
-    return problem_response(error.status_code, str(error.detail), errors, dict(error.headers or {}))
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        return _not_allowed(request)
+    if error.status_code == HTTPStatus.NOT_FOUND and (target := _with_other_slash(request)):
+        return RedirectResponse(target)
+    if error.status_code == HTTPStatus.BAD_REQUEST:
+        return problem_response(
+            error.status_code, f"The body {NOT_JSON}.", [FieldError(field="body", message=NOT_JSON)]
+        )
+    return problem_response(error.status_code, str(error.detail), headers=dict(error.headers or {}))
 
 
-def _field_error(item: dict[str, Any]) -> FieldError:
+def _not_allowed(request: Request) -> Response:
+    """Answer a method that isn't served at a path: OPTIONS asks for those that are."""
+    methods = ", ".join(methods_at(request.scope))
+    if request.method == "OPTIONS":
+        return Response(status_code=HTTPStatus.NO_CONTENT, headers={"Allow": methods})
+    detail = f"`{_truncated(request.method, MAX_FIELD_LENGTH)}` isn't served here, only {methods}."
+    return problem_response(HTTPStatus.METHOD_NOT_ALLOWED, detail, headers={"Allow": methods})
+
+
+def _with_other_slash(request: Request) -> str | None:
+    """Return the address with or without a slash at its end, if only that is served.
+
+    It has no host: that of the request may lack a port that the client uses.
+    """
+    scope, path = request.scope, request.scope["path"]
+    other = path.rstrip("/") if path.endswith("/") else f"{path}/"
+    if "endpoint" in scope or not methods_at({**scope, "path": other}):
+        return None
+    prefix, query = scope["root_path"], request.url.query
+    return prefix + quote(other.removeprefix(prefix)) + (f"?{query}" if query else "")
+
+
+def _field_error(item: Mapping[str, Any]) -> FieldError:
     """Return one of pydantic's errors, without its input, which may be large or not representable in JSON."""
-    field, message = _field_name(item["loc"]), item["msg"]
-    if field == "body" and item["type"] != "missing":
-        message = f"must be a JSON object, sent as content-type: application/json ({message})"
+    field, message = _field_name(item["loc"]), message_of(item)
+    if field == "body":
+        message = NOT_JSON
     if item["type"] in ("union_tag_invalid", "union_tag_not_found"):
         field, message = f"{field}.type", "must be one of the types listed at /docs"
         if tags := item.get("ctx", {}).get("expected_tags"):
             message = f"must be one of {tags}"
     return FieldError(field=field, message=message)
+
+
+def message_of(item: Mapping[str, Any]) -> str:
+    """Return the text of one of pydantic's errors."""
+    return MESSAGES[item["type"]].format(**item.get("ctx", {})) if item["type"] in MESSAGES else item["msg"]
 
 
 def _field_name(location: Sequence[str | int]) -> str:

@@ -18,7 +18,7 @@ KeyScope = Literal["read", "write", "operate"]
 """read: frames, scenes, documentation. write: add, replace and delete scenes. operate: metrics."""
 
 SCOPES: tuple[KeyScope, ...] = get_args(KeyScope)
-OPEN_PATHS = ("/live", "/ready", "/")
+OPEN_PATHS = ("/live", "/ready", "/", "")
 OPEN_FOLDER = "/viewer/"
 OPERATED_PATHS = ("/metrics",)
 WRITTEN_PATH, WRITTEN_FOLDER = "/scenes", "/scenes/"

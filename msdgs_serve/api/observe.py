@@ -12,14 +12,15 @@ from urllib.parse import quote
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from msdgs_serve.api.errors import KIND, server_error
+from msdgs_serve.api.methods import METHODS
 from msdgs_serve.api.metrics import Metrics
+from msdgs_serve.api.prefix import route_path
 
 REQUEST_ID = "X-Request-ID"
 IDENTITY = REQUEST_ID.lower().encode()  # as ASGI names it
 USABLE_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 FIRST_ERROR = 400
 UNKNOWN_METHOD = "other"
-METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 
 request_id: contextvars.ContextVar[str | None] = contextvars.ContextVar("request_id", default=None)
 logger = logging.getLogger("msdgs_serve")
@@ -27,7 +28,7 @@ access_log = logging.getLogger("msdgs_serve.access")
 
 
 class Observe:
-    """The outermost ASGI middleware. Keeps a client's `X-Request-ID` if it is valid."""
+    """ASGI middleware around all that answers. Keeps a client's `X-Request-ID` if it is valid."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         self._app = app
@@ -38,25 +39,23 @@ class Observe:
             await self._app(scope, receive, send)
             return
         token = request_id.set(usable_id(dict(scope["headers"]).get(IDENTITY, b"")))
-        answer = _Answer(send)
+        answer, path = _Answer(send), route_path(scope)
         started = time.perf_counter()
         try:
             await self._app(scope, receive, answer.send)
         except Exception as error:
-            logger.error("%s %s failed", scope["method"], quote(scope["path"]), exc_info=error)
+            logger.error("%s %s failed", scope["method"], quote(path), exc_info=error)
             scope[KIND] = "internal"
             if answer.status is not None:
                 raise  # the response has started: the server closes the connection
             await server_error()(scope, receive, answer.send)
         finally:
-            self._record(scope, answer, time.perf_counter() - started)
+            self._record(scope, path, answer, time.perf_counter() - started)
             request_id.reset(token)
 
-    def _record(self, scope: Scope, answer: "_Answer", seconds: float) -> None:
+    def _record(self, scope: Scope, path: str, answer: "_Answer", seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "unmatched")
-        answered = Answered(
-            scope["method"], scope["path"], route, answer.status or 0, scope.get(KIND), seconds, answer.sent
-        )
+        answered = Answered(scope["method"], path, route, answer.status or 0, scope.get(KIND), seconds, answer.sent)
         record(self._metrics, answered, scope.get("client"))
 
 

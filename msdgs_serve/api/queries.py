@@ -4,6 +4,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from msdgs_serve.api.errors import message_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.baked import SceneMetadata
@@ -28,7 +29,9 @@ def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:
         return RenderRequest.model_validate(body)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
-        raise InvalidInput(_parameter(first["loc"]), f"as in POST /render ({first['msg']})", "another value") from None
+        raise InvalidInput(
+            _parameter(first["loc"]), f"as in POST /render ({message_of(first)})", "another value"
+        ) from None
 
 
 def by_parameter(error: InvalidInput) -> InvalidInput:

@@ -298,7 +298,7 @@ class VideoRequest(Strict):
     width: Pixels | None = Field(default=None, description="pixels; default: the path's, else the first camera's")
     height: Pixels | None = Field(default=None, description="pixels; required with `width`")
     fps: FramesPerSecond | None = Field(default=None, description="frames per second; default: the path's, else 24")
-    format: VideoFormat = Field(default="mp4", description="`mp4`: H.264. `webm`: VP9. `webp`: animated")
+    format: VideoFormat = Field(default="mp4", description="`mp4`: H.264, odd: 4:4:4. `webm`: VP9. `webp`: animated")
     background: VideoBackground = Field(default="scene", description="`scene`, or sRGB-encoded, 0 to 1")
 
 

@@ -42,7 +42,7 @@ class Server(uvicorn.Server):
             access_log=False,
             timeout_graceful_shutdown=CLOSING_SECONDS,
             server_header=False,
-            forwarded_allow_ips=settings.proxies,
+            proxy_headers=False,  # the application reads them
         )
         super().__init__(config)
         self._drain_seconds = settings.drain_seconds

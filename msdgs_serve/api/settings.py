@@ -6,10 +6,11 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from pydantic.fields import FieldInfo
+from pydantic_core import PydanticCustomError
 from pydantic_settings import (
     BaseSettings,
     CliImplicitFlag,
@@ -20,6 +21,7 @@ from pydantic_settings import (
     SettingsConfigDict,
 )
 
+from msdgs_serve.api.prefix import read_prefix
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.store import SceneStore
@@ -31,6 +33,14 @@ PROGRAM = "msdgs-serve"
 def one_per_thread(settings: dict[str, Any]) -> int:
     """Return the default number of concurrent renders; more slow each other down."""
     return min(settings.get("threads") or thread_count(), 64)
+
+
+def _prefix(text: str) -> str:
+    try:
+        return read_prefix(text)
+    except ValueError:
+        message = "must be a path such as /msdgs: from /, without //, . or .., query and host, got '{given}'"
+        raise PydanticCustomError("prefix", message, {"given": text[:100]}) from None
 
 
 class Settings(BaseSettings):
@@ -124,7 +134,11 @@ class Settings(BaseSettings):
         description="file with `scopes key` per line, scopes of read, write, operate; requests need a key then",
     )
     proxies: str = Field(
-        default="127.0.0.1", description="addresses of trusted proxies for X-Forwarded-For, joined by commas; or *"
+        default="127.0.0.1",
+        description="addresses of trusted proxies for X-Forwarded-For, -Proto and -Prefix, joined by commas; or *",
+    )
+    root_path: Annotated[str, AfterValidator(_prefix)] = Field(
+        default="", description="path below which a proxy serves, such as /msdgs; X-Forwarded-Prefix replaces it"
     )
     cors_origins: list[str] = Field(
         default=[], description="origins of web pages that may call, such as https://example.org; or *"

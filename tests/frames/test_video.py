@@ -10,6 +10,8 @@ import av
 import httpx
 import numpy as np
 import OpenImageIO as oiio
+import PIL.Image
+import PIL.ImageSequence
 import pytest
 from av.video.reformatter import ColorRange
 
@@ -20,11 +22,11 @@ from msdgs_serve.render_cli import INTERRUPTED, main
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.threads import THREADS_VARIABLE
-from msdgs_serve.video import BT709, VideoFormat, write_video
+from msdgs_serve.video import BT709, VIDEO_FORMATS, VideoFormat, write_video
 from tests.support.images import decode, psnr
 from tests.support.scene_files import level_camera
 from tests.support.service import check_problem, serving
-from tests.support.tolerances import assert_close
+from tests.support.tolerances import assert_close, tolerance
 
 SIZE = 64
 POSE = level_camera().camera_to_world
@@ -43,6 +45,11 @@ def frames_of(video: bytes) -> tuple[list[np.ndarray], float]:
         rate = container.streams.video[0].average_rate
         assert rate is not None
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)], float(rate)
+
+
+def stills_of(webp: bytes) -> list[np.ndarray]:
+    with PIL.Image.open(io.BytesIO(webp)) as image:
+        return [np.asarray(frame.convert("RGB")) for frame in PIL.ImageSequence.Iterator(image)]
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +154,7 @@ def test_an_animated_webp_shows_the_frames(tmp_path: Path):
         ({"frames": [{"camera": ORBIT, "t": 0}] * 11}, "frames"),
         ({"frames": [{"camera": ORBIT, "t": 0}] * 10, "width": 200, "height": 100}, "frames"),
         ({"path": nerfstudio(), "width": 10}, "width"),
-        ({"path": nerfstudio(), "width": 1, "height": 1}, "width"),
+        ({"path": nerfstudio(), "width": 0, "height": 1}, "width"),
         ({"path": nerfstudio(), "format": "gif"}, "format"),
         ({"path": nerfstudio(), "format": "webp", "width": 16384, "height": 2}, "width"),
         ({"path": nerfstudio(), "fps": 1e-4}, "fps"),
@@ -158,11 +165,38 @@ def test_invalid_videos(client: httpx.Client, body: dict[str, Any], field: str):
     check_problem(client.post("/render/video", json=body), 422, field)
 
 
-def test_odd_sizes_lose_an_edge():
+@pytest.mark.parametrize("video_format", VIDEO_FORMATS)
+@pytest.mark.parametrize("size", [(13, 11), (12, 11), (13, 10), (12, 10), (201, 151), (1, 1), (1, 8), (7, 1), (2, 2)])
+def test_a_video_has_the_size_that_was_asked_for(video_format: VideoFormat, size: tuple[int, int]):
+    width, height = size
+    gray = np.linspace(60, 220, height)[:, None] - np.linspace(0, 60, width)
+    frames = [np.repeat(gray[..., None] + 20 * number, 3, axis=2).astype(np.uint8) for number in range(2)]
     file = io.BytesIO()
-    assert write_video([np.full((11, 13, 3), 200, np.uint8)] * 2, 24, "mp4", file) == 2
-    frames, _ = frames_of(file.getvalue())
-    assert frames[0].shape == (10, 12, 3)
+    assert write_video(frames, 24, video_format, file) == 2
+    shown = stills_of(file.getvalue()) if video_format == "webp" else frames_of(file.getvalue())[0]
+    for frame, expected in zip(shown, frames, strict=True):
+        assert frame.shape == (height, width, 3)
+        for edge in (np.s_[:], np.s_[-1], np.s_[:, -1]):
+            off = np.abs(frame[edge].astype(float) - expected[edge]).mean()
+            assert off <= tolerance("video_edge.mean")
+
+
+@pytest.mark.parametrize("video_format", VIDEO_FORMATS)
+def test_odd_sizes_of_both_ways_to_a_video(
+    client: httpx.Client, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], video_format: str
+):
+    body = {"path": nerfstudio(2, render_width=21, render_height=15), "format": video_format}
+    response = client.post("/render/video", json=body)
+    file = tmp_path / f"turn.{video_format}"
+    assert run(scene, file, "--frames", 2, "--width", 21, "--height", 15) == 0
+    printed = capsys.readouterr().out
+    assert "2 frames of 21 × 15" in printed
+    assert ("of even sizes only" in printed) == (video_format == "mp4")
+    for video in (response.content, file.read_bytes()):
+        frames = stills_of(video) if video_format == "webp" else frames_of(video)[0]
+        assert [frame.shape for frame in frames] == [(15, 21, 3)] * 2
+    assert run(scene, tmp_path / f"even.{video_format}", "--frames", 1, "--width", 20, "--height", 14) == 0
+    assert "even sizes" not in capsys.readouterr().out
 
 
 def run(*arguments: object) -> int:
@@ -259,6 +293,17 @@ def test_errors_are_one_line(
     assert message in complaint
     assert complaint.count("\n") == 1
     assert not list(Path().glob("*.frames")), "before frames are drawn"
+
+
+@pytest.mark.parametrize(
+    ("out", "reason"), [("file", "file: File exists"), ("file/turn.mp4", "file/turn.mp4.frames: Not a directory")]
+)
+def test_a_file_in_the_way_is_named(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, reason: str
+):
+    (tmp_path / "file").touch()
+    assert run(scene, tmp_path / out, "--frames", 1) == 2
+    assert capsys.readouterr().err == f"msdgs-render: {tmp_path}/{reason}\n"
 
 
 def test_a_folder_may_have_a_dot_in_its_name(scene: Path, tmp_path: Path):

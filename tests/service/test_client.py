@@ -1,13 +1,32 @@
 """The Python client against a real service."""
 
-from collections.abc import Iterator
+import io
+import json
+import re
+import zipfile
+from collections.abc import Callable, Iterator
+from decimal import Decimal
+from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 
-from msdgs_serve.client import Client, LookAt, Matrix, Orbit, Problem, SceneCamera, Shutter, Unreachable, request_body
+from msdgs_serve.client import (
+    WIDTHS,
+    Client,
+    ClientError,
+    LookAt,
+    Matrix,
+    Orbit,
+    Problem,
+    SceneCamera,
+    Shutter,
+    Unreachable,
+    request_body,
+)
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging.encode import npy
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
@@ -45,7 +64,7 @@ def test_every_kind_of_camera(client: Client):
     pose, focal = level_camera().camera_to_world, SIZE / 2 / np.tan(np.radians(20))
     expected = client.render(LEVEL, 0.0, width=SIZE, height=SIZE).rgb
     cameras = [
-        LookAt(pose[:3, 3], [0, 0, 0], UP, 40),  # pyright: ignore[reportArgumentType]
+        LookAt(pose[:3, 3], [0, 0, 0], UP, 40),
         Matrix(pose, fov_y=40),
         Matrix(pose, fx=focal, fy=focal, cx=SIZE / 2, cy=SIZE / 2),
         Matrix(pose @ OPENGL_TO_OPENCV, "opengl", fx=focal),
@@ -57,6 +76,116 @@ def test_every_kind_of_camera(client: Client):
     named = client.render(SceneCamera(name="view_0"), 0.0, channels=("depth", "rgb"))
     assert named.alpha is None
     assert [part.shape for part in (named.rgb, named.depth) if part is not None] == [(48, 64, 3), (48, 64)]
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble, np.int8, np.uint64])
+def test_numbers_of_numpy_are_those_of_python(client: Client, dtype: type):
+    expected = client.render(Orbit(20, 10, 5, (0, 0, 0), (0, 0, 1), 40), 1, width=16, height=12, steps=None)
+    elevation: Any = np.array(10, dtype)
+    up: list[Any] = [dtype(0), np.array(0, dtype), dtype(1)]
+    camera = Orbit(dtype(20), elevation, dtype(5), np.zeros(3, dtype), up, dtype(40))
+    for t in (dtype(1), np.array(1, dtype), Fraction(1), Decimal("1.0")):
+        frame = client.render(camera, t, width=np.int64(16), height=np.array(12, np.uint8), scene=np.str_("balls"))  # pyright: ignore[reportArgumentType]
+        np.testing.assert_array_equal(frame.rgb, expected.rgb)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble, np.int8, np.uint64])
+def test_every_field_of_a_body_may_be_of_numpy(client: Client, dtype: type):
+    one, vector = dtype(1), np.array([0, 0, 4], dtype)
+    camera = Matrix(
+        np.eye(4, dtype=dtype), fx=one, fy=one, cx=one, cy=one, model="fisheye", distortion=np.zeros(4, dtype)
+    )
+    channels: Any = np.array(["rgb", "motion"])
+    body = request_body(
+        camera, one, width=np.int16(16), height=np.int32(12), quality=np.uint8(7), background=(one, dtype(0), one),
+        shutter=Shutter(dtype(0), one, np.int8(3)), dt=one, steps=one, channels=channels,
+    )  # fmt: skip
+    plain = {
+        "camera": {
+            "type": "matrix", "camera_to_world": np.eye(4).tolist(), "axes": "opencv", "fx": 1, "fy": 1, "cx": 1,
+            "cy": 1, "model": "fisheye", "distortion": [0, 0, 0, 0],
+        },
+        "t": 1, "width": 16, "height": 12, "format": "png", "quality": 7, "channels": ["rgb", "motion"],
+        "background": [1, 0, 1], "dt": 1, "steps": 1, "shutter": {"open": 0, "close": 1, "samples": 3},
+    }  # fmt: skip
+    assert json.loads(json.dumps(body)) == plain
+    seen = client.render(LookAt(vector, vector * 0, np.array([0, 1, 0], dtype), dtype(40)), one, width=16, height=12)
+    by_python = client.render(LookAt([0, 0, 4], [0, 0, 0], [0, 1, 0], 40), 1, width=16, height=12)
+    np.testing.assert_array_equal(seen.rgb, by_python.rgb)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    "times", [[0.0, 0.5, 1.0], (0, 0.5, 1), np.linspace(0, 1, 3), np.linspace(0, 1, 3, dtype="f4")]
+)
+def test_a_list_of_times_gives_arrays_of_as_many_frames(client: Client, times: Any):
+    several = client.render(LEVEL, times, width=16, height=12, channels=tuple(WIDTHS), dt=0.0)
+    assert several.rgb is not None
+    assert several.rgb.shape == (3, 12, 16, 3)
+    for number, t in enumerate((0.0, 0.5, 1.0)):
+        alone = client.render(LEVEL, t, width=16, height=12, channels=tuple(WIDTHS), dt=0.0)
+        for name in WIDTHS:
+            np.testing.assert_array_equal(getattr(several, name)[number], getattr(alone, name))
+    one = client.render(LEVEL, times[:1], width=16, height=12).depth
+    assert one is not None
+    assert one.shape == (1, 12, 16)
+    with zipfile.ZipFile(io.BytesIO(client.render_file(LEVEL, times, width=16, height=12))) as archive:
+        assert len(archive.namelist()) == 3
+
+
+NO_NUMBERS = [
+    float("nan"), -float("inf"), np.float32("nan"), np.array(np.inf), [0.0, np.nan], np.array([0.0, -np.inf]), 1j,
+    np.complex64(1), np.datetime64("2026-01-01"), object(), {0.5}, b"0.5", (t for t in [0.5]), 10**5000,
+    [None, object()], np.longdouble("1e400"), Decimal("NaN"), np.ma.masked, np.array([object()]), [[0.5], {1}],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=lambda value: type(value).__name__)
+def test_what_is_no_number_is_refused_by_name(client: Client, value: Any):
+    calls: list[tuple[str, Callable[[], object]]] = [
+        ("t", lambda: client.render(LEVEL, value)),
+        ("width", lambda: client.render(LEVEL, 0.5, width=value)),
+        ("background", lambda: client.render_file(LEVEL, 0.5, background=value)),
+        ("camera.azimuth", lambda: client.render(Orbit(value, 0), 0.5)),
+        ("camera.camera_to_world", lambda: client.render(Matrix(value, fov_y=40), 0.5)),
+        ("shutter.open", lambda: client.render(LEVEL, 0.5, shutter=Shutter(value, 1))),
+        ("frames.1.t", lambda: list(client.render_many([request_body(LEVEL, 0.5), {"t": value}]))),
+    ]
+    for name, call in calls:
+        with pytest.raises(ClientError, match=rf"^`{re.escape(name)}[.\d]*` must be a finite number") as error:
+            call()
+        assert not isinstance(error.value, Problem)
+
+
+@pytest.mark.parametrize(
+    ("t", "width"),
+    [("0.5", 16), (np.bool_(True), 16), (0.5, np.float64(16)), (0.5, True), (0.5, 2**70), ([], 16), ([[0.5]], 16),
+     (np.array([]), 16), (np.zeros((1, 1)), 16), (2.0, 16), (0.5, [16]), (0.5, "16")],
+)  # fmt: skip
+def test_values_that_the_service_refuses_are_problems(client: Client, t: Any, width: Any):
+    with pytest.raises(Problem, match="422"):
+        client.render(LEVEL, t, width=width, height=12)
+
+
+def test_names_that_utf8_cannot_hold_are_refused(client: Client):
+    with pytest.raises(ClientError, match="`scene` must be text"):
+        client.render(LEVEL, 0.5, scene="\udce9")
+
+
+def test_a_background_of_null_stays_in_a_body(client: Client):
+    bodies: list[dict[str, Any]] = [{**request_body(LEVEL, 0.5, width=8, height=8), "background": None}]
+    assert dict(client.render_many(bodies))[0] == client.render_file(
+        LEVEL, 0.5, width=8, height=8, background="transparent"
+    )
+
+
+@pytest.mark.parametrize("content", [b"", b"<html>", npy(np.zeros((2, 2, 5), np.float32))[:100], b"PK\x03\x04"])
+def test_an_answer_of_another_service_is_named(content: bytes):
+    answer = httpx.Response(200, headers={"Content-Type": "text/html"}, content=content)
+    with (
+        Client(transport=httpx.MockTransport(lambda _: answer)) as client,
+        pytest.raises(ClientError, match="no array of pixels, but text/html"),
+    ):
+        client.render(LEVEL, 0.5)
 
 
 def test_files_and_blur(client: Client):

@@ -98,7 +98,7 @@ def test_the_calls_are_these(client: httpx.Client):
         "/scenes/{name}/file",
         *("/live", "/ready", "/metrics"),
     }
-    answers = {"200", "304", "400", "404", "408", "413", "422", "503", "504"}
+    answers = {"200", "304", "400", "404", "408", "413", "415", "422", "503", "504"}
     assert set(paths["/render"]["post"]["responses"]) == answers
 
 

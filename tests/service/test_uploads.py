@@ -39,7 +39,10 @@ def test_a_scene_is_added_shown_and_deleted(client: httpx.Client, folder: Path, 
     response = add(client, file, sha256=hashlib.sha256(file).hexdigest())
     assert response.status_code == 201, response.text
     assert response.json() == {"name": "walk", "sha256": hashlib.sha256(file).hexdigest()}
-    assert client.get(response.headers["Location"]).json()["sha256"] == response.json()["sha256"]
+    assert (
+        client.get(response.request.url.join(response.headers["Location"])).json()["sha256"]
+        == response.json()["sha256"]
+    )
     assert client.post("/render", json=FRAME).status_code == 200
     assert client.delete("/scenes/walk").status_code == 204
     assert client.post("/render", json={**FRAME, "scene": "walk"}).status_code == 404

@@ -119,6 +119,7 @@ TABLE = (
     Row("rounded_to_8bit", 0.501, "half a step of 8 bits, and the float32 sums before it"),
     Row("composite_of_8bit", 1.001 / 255, "half a step of color and half a step of alpha, each rounded once"),
     Row("video_color", 4.0, "of 255, even colors: YCbCr has 219 steps for 255, and is rounded on both ways"),
+    Row("video_edge.mean", 8.0, "of 255, an edge of a gray ramp: the codecs' quantization, on few pixels"),
     Row("video_image.mean", 1.0, "of 255, waves: as video_color, on average; FFmpeg's fast way is 1.4 to 2 off"),
     Row("ray_hit", 1e-3, "scene units; a ray stops 2e-4 before a surface, earlier in a bent one or along a wall"),
     Row("material_point", 1e-6, "scene units; trajectories are written with 7 digits"),

@@ -55,7 +55,7 @@ class _Equal:
     "/render/batch",
     summary="Many frames",
     response_class=StreamingResponse,
-    responses={**BATCH_RESPONSE, **problems(400, 408, 413, 422, 503)},
+    responses={**BATCH_RESPONSE, **problems(400, 408, 413, 415, 422, 503)},
 )
 async def render_batch(
     body: BatchRequest, service: SharedService, accept: Annotated[str | None, Header(max_length=1000)] = None

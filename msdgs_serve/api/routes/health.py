@@ -15,14 +15,12 @@ from msdgs_serve.api.service import Phase, SharedService
 router = APIRouter(tags=["operation"])
 
 
-@router.head("/live", include_in_schema=False)
 @router.get("/live", summary="Whether the process answers")
 async def live() -> Live:
     """Always answers; needs no key."""
     return Live(version=__version__)
 
 
-@router.head("/ready", include_in_schema=False)
 @router.get("/ready", summary="Whether the service is ready", responses=problems(503))
 async def ready(service: SharedService) -> Ready:
     """503 until scenes are loaded and kernels compiled, and while the service is stopping; needs no key."""

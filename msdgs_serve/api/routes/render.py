@@ -17,7 +17,7 @@ from msdgs_serve.api.work import unless_gone
 from msdgs_serve.render_job import RenderJob
 from msdgs_serve.scene import InvalidInput
 
-RESPONSES = {**IMAGE_RESPONSE, **NOT_MODIFIED, **problems(400, 404, 408, 413, 422, 503, 504)}
+RESPONSES = {**IMAGE_RESPONSE, **NOT_MODIFIED, **problems(400, 404, 408, 413, 415, 422, 503, 504)}
 
 router = APIRouter(tags=["frames"])
 

@@ -107,7 +107,7 @@ def scene_file(
     summary="Add a scene",
     status_code=HTTPStatus.CREATED,
     openapi_extra=SCENE_BODY,
-    responses=problems(400, 403, 408, 409, 413, 422, 503, 507),
+    responses=problems(400, 403, 408, 409, 413, 415, 422, 503, 507),
 )
 async def add_scene(
     name: NewName,
@@ -138,7 +138,7 @@ async def add_scene(
         raise RequestRejected(HTTPStatus.UNPROCESSABLE_ENTITY, "invalid_scene", detail, field="body") from None
     finally:
         incoming.unlink(missing_ok=True)
-    response.headers["Location"] = f"/scenes/{quote(name, safe='')}"
+    response.headers["Location"] = f"{request.scope['root_path']}/scenes/{quote(name, safe='')}"
     return SceneAdded(name=added.name, sha256=added.sha256)
 
 

@@ -29,7 +29,7 @@ router = APIRouter(tags=["frames"])
     "/render/video",
     summary="A video along a camera path",
     response_class=Response,
-    responses={**VIDEO_RESPONSE, **problems(400, 404, 408, 413, 422, 501, 503, 504)},
+    responses={**VIDEO_RESPONSE, **problems(400, 404, 408, 413, 415, 422, 501, 503, 504)},
 )
 async def render_video(body: VideoRequest, service: SharedService, request: Request) -> Response:
     """Streams the video while its frames are rendered, with renders of other requests in between. The time limit holds
@@ -37,7 +37,7 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
 
     For long videos use `msdgs-render` on the machine itself, which shows its progress and can be resumed.
     """
-    require_pyav()
+    require_pyav(body.format)
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
     stream = _stream_video(service, body, scene, path)
     first = await unless_gone(request, anext(stream))  # an error in the first frame still gets its status

@@ -13,7 +13,6 @@ from msdgs_serve.api.frames import IfNoneMatch, is_unchanged
 
 FOLDER = Path(__file__).parents[2] / "viewer"
 PAGE = "index.html"
-METHODS = ["GET", "HEAD"]
 MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -49,13 +48,13 @@ FILES = _read(FOLDER)
 router = APIRouter(include_in_schema=False)
 
 
-@router.api_route("/", methods=METHODS)
+@router.get("/")
 async def page(if_none_match: IfNoneMatch = None) -> Response:
     """Return the page."""
     return _answer(FILES[PAGE], if_none_match)
 
 
-@router.api_route("/viewer/{name}", methods=METHODS)
+@router.get("/viewer/{name}")
 async def page_file(name: str, if_none_match: IfNoneMatch = None) -> Response:
     """Return a file of the page."""
     if name not in FILES:
