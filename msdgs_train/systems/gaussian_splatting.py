@@ -150,6 +150,7 @@ class GaussianSplatting:
             training_cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in others[len(shown) :]],
             size=self.config.data.size,
             llffhold=self.config.data.llffhold,
+            time_from=self.config.data.time_from,
         )
 
     def _options(self, step: int) -> RasterizerOptions:

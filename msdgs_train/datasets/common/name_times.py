@@ -1,0 +1,166 @@
+"""Times of images from their names, which are read together.
+
+The time is the number that varies and never repeats among the images of one camera. Where several numbers may be it,
+cameras that stand still decide, then dates and epochs, words such as `cam` and `frame`, and cameras with different
+lenses. If more than one remains, the names are ambiguous.
+"""
+
+import re
+from collections.abc import Hashable, Sequence
+from fractions import Fraction
+from itertools import pairwise
+from typing import NamedTuple
+
+from msdgs_train.datasets.common.name_fields import (
+    CAMERA_WORDS,
+    DAY,
+    STAMPS,
+    TIME_WORDS,
+    Field,
+    natural_order,
+    parse_value,
+    read_fields,
+)
+
+PHOTO_WORDS = re.compile(r"img|dsc[nf]?|mg|imgp|sam|dji|gopr|photo|pict?")
+"""Words before the numbers that a camera gives to its photographs."""
+RECORDING_WORDS = re.compile(r"(?:take|clip|part|chapter|video|vid|shot|seq|sequence|session|rec|g[xhls]|mvi)s?")
+"""Words before the number of a recording. If it varies, frames may count anew in each."""
+
+Times = tuple[Fraction, ...]
+
+
+class Reading(NamedTuple):
+    """One way to read the names."""
+
+    times: Times  # in the unit of the names
+    texts: tuple[str, ...]  # the times as the names have them
+    pattern: str | None  # a regular expression that finds them, if a simple one does
+    is_photo_number: bool = False
+
+
+class NameWithoutTime(Exception):
+    """A name has no number where others have one; the argument is that name."""
+
+
+def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[Hashable]) -> list[Reading]:
+    """The likely times of names; several readings if they are ambiguous, none if no number varies.
+
+    `poses` are equal for images taken from the same place, `lenses` for those that may be of the same camera. Raises
+    `NameWithoutTime`.
+    """
+    fields = read_fields(names)
+    if not fields and len(names) > 1:
+        raise NameWithoutTime(next((name for name in names if not re.search(r"\d[^/]*$", name)), names[0]))
+    fields = _merged([field for field in fields if len(set(field.values)) > 1])
+    steps = (
+        _without_labels,
+        lambda kept: _without_repeats(kept, poses),
+        _finest,
+        _named,
+        lambda kept: _without_repeats(kept, lenses) if len(set(lenses)) > 1 and not _may_restart(kept) else kept,
+    )
+    for step in steps:
+        if len(fields) > 1:
+            fields = step(fields) or fields
+    return [_reading(names, field) for field in fields]
+
+
+def times_in_order(names: Sequence[str]) -> Times:
+    """The place of each name in their natural order."""
+    places = {name: place for place, name in enumerate(sorted(set(names), key=natural_order))}
+    return tuple(Fraction(places[name]) for name in names)
+
+
+def times_by_pattern(names: Sequence[str], expression: re.Pattern[str]) -> Times:
+    """The numbers, dates and clocks that `time_group` finds. Raises `NameWithoutTime`."""
+    group = time_group(expression)
+    times = []
+    for name in names:
+        match = expression.search(name)
+        time = parse_value(match[group] or "") if match and group else None
+        if time is None:
+            raise NameWithoutTime(name)
+        times.append(time)
+    return tuple(times)
+
+
+def time_group(expression: re.Pattern[str]) -> str | int | None:
+    """The group of the time: the one named `time`, or the only one."""
+    if "time" in expression.groupindex:
+        return "time"
+    return 1 if expression.groups == 1 else None
+
+
+def _merged(fields: list[Field]) -> list[Field]:
+    """Without fields that say the same again, such as a folder's number in the names of its files."""
+    kept: dict[Times, Field] = {}
+    for field in fields:
+        first, last = min(field.values), max(field.values)
+        key = tuple((value - first) / (last - first) for value in field.values)
+        same = kept.get(key)
+        kept[key] = same._replace(words=same.words | field.words) if same else field
+    return list(kept.values())
+
+
+def _without_labels(fields: list[Field]) -> list[Field]:
+    """Without numbers that belong to a text, such as `left1` and `right2`."""
+    return [field for field in fields if len(set(field.texts)) != len(set(zip(field.texts, field.values, strict=True)))]
+
+
+def _without_repeats(fields: list[Field], cameras: Sequence[Hashable]) -> list[Field]:
+    """Without those that repeat among the images of one camera."""
+    return [field for field in fields if len(set(zip(cameras, field.values, strict=True))) == len(cameras)]
+
+
+def _finest(fields: list[Field]) -> list[Field]:
+    """Without those that another one refines, such as the part of a video by frames that count on; and without a
+    photograph's number beside another one in the same order."""
+    return [
+        field
+        for field in fields
+        if not any(
+            _grows_with(field, other)
+            and (not _grows_with(other, field) or (field.is_called(PHOTO_WORDS) and not other.is_called(PHOTO_WORDS)))
+            for other in fields
+        )
+    ]
+
+
+def _grows_with(field: Field, other: Field) -> bool:
+    """Whether a field is a function of another that never falls."""
+    pairs = sorted(set(zip(other.values, field.values, strict=True)))
+    return all(one[0] < two[0] and one[1] <= two[1] for one, two in pairwise(pairs))
+
+
+def _named(fields: list[Field]) -> list[Field]:
+    """Dates and epochs that vary most, else those that are called times, else those that aren't called cameras."""
+    fields = [field for field in fields if not field.is_called(CAMERA_WORDS)] or fields
+    most = max(len(set(field.values)) for field in fields)
+    stamps = [field for field in fields if _is_stamp(field) and len(set(field.values)) == most]
+    if stamps or _may_restart(fields):
+        return stamps or fields
+    return [field for field in fields if field.is_called(TIME_WORDS)] or fields
+
+
+def _may_restart(fields: list[Field]) -> bool:
+    """Whether there is a number or date of recordings, in each of which frames may count anew."""
+    return len(fields) > 1 and any(_is_stamp(field) or field.is_called(RECORDING_WORDS) for field in fields)
+
+
+def _is_stamp(field: Field) -> bool:
+    return field.tokens[0].form in STAMPS
+
+
+def _reading(names: Sequence[str], field: Field) -> Reading:
+    times = field.values
+    if field.tokens[0].form == "clock":  # without a date: the day changes in a gap of more than half a day
+        ordered = sorted(set(times))
+        midnight = next((two for one, two in pairwise(ordered) if two - one > DAY // 2), None)
+        if midnight is not None:
+            times = tuple(time + DAY * (time < midnight) for time in times)
+    finds = re.compile(field.pattern).search
+    texts = tuple(token.text for token in field.tokens)
+    is_found = all((match := finds(name)) and match[1] == text for name, text in zip(names, texts, strict=True))
+    is_photo = field.is_called(PHOTO_WORDS) and not _is_stamp(field)
+    return Reading(times, texts, field.pattern if is_found else None, is_photo)
