@@ -37,7 +37,7 @@ def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0, tim
     for _, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
             own = NAMES if load is load_colmap else None  # COLMAP stores no times
-            scene = timed(load(folder, size), folder, time_from or own).in_unit_time()
+            scene = timed(load(folder, size), folder, own if time_from is None else time_from).in_unit_time()
             return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
     raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

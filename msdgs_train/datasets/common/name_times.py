@@ -9,14 +9,17 @@ import re
 from collections.abc import Hashable, Sequence
 from fractions import Fraction
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from msdgs_train.datasets.common.name_fields import (
     CAMERA_WORDS,
     DAY,
+    EXTENSION,
     STAMPS,
     TIME_WORDS,
     Field,
+    Number,
+    Token,
     natural_order,
     parse_value,
     read_fields,
@@ -27,7 +30,7 @@ PHOTO_WORDS = re.compile(r"img|dsc[nf]?|mg|imgp|sam|dji|gopr|photo|pict?")
 RECORDING_WORDS = re.compile(r"(?:take|clip|part|chapter|video|vid|shot|seq|sequence|session|rec|g[xhls]|mvi)s?")
 """Words before the number of a recording. If it varies, frames may count anew in each."""
 
-Times = tuple[Fraction, ...]
+Times = tuple[Number, ...]
 
 
 class Reading(NamedTuple):
@@ -36,7 +39,7 @@ class Reading(NamedTuple):
     times: Times  # in the unit of the names
     texts: tuple[str, ...]  # the times as the names have them
     pattern: str | None  # a regular expression that finds them, if a simple one does
-    is_photo_number: bool = False
+    called: Literal["camera", "photograph"] | None  # what the words before the number say, if not a time
 
 
 class NameWithoutTime(Exception):
@@ -52,8 +55,9 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
     fields = read_fields(names)
     if not fields and len(names) > 1:
         raise NameWithoutTime(next((name for name in names if not re.search(r"\d[^/]*$", name)), names[0]))
-    fields = _merged([field for field in fields if len(set(field.values)) > 1])
+    fields = _dated([field for field in fields if len(set(field.values)) > 1])
     steps = (
+        _merged,
         _without_labels,
         lambda kept: _without_repeats(kept, poses),
         _finest,
@@ -67,9 +71,10 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
 
 
 def times_in_order(names: Sequence[str]) -> Times:
-    """The place of each name in their natural order."""
-    places = {name: place for place, name in enumerate(sorted(set(names), key=natural_order))}
-    return tuple(Fraction(places[name]) for name in names)
+    """The place of each file's name in their natural order; those that differ in the folder alone share a place."""
+    files = [EXTENSION.sub("", name.rsplit("/", 1)[-1]) for name in names]
+    places = {file: place for place, file in enumerate(sorted(set(files), key=natural_order))}
+    return tuple(places[file] for file in files)
 
 
 def times_by_pattern(names: Sequence[str], expression: re.Pattern[str]) -> Times:
@@ -92,12 +97,27 @@ def time_group(expression: re.Pattern[str]) -> str | int | None:
     return 1 if expression.groups == 1 else None
 
 
+def _dated(fields: list[Field]) -> list[Field]:
+    """With the only date, of a folder for example, added to the only clock."""
+    dates = [field for field in fields if all(token.is_date for token in field.tokens)]
+    clocks = [field for field in fields if field.tokens[0].form == "clock"]
+    if len(dates) != 1 or len(clocks) != 1:
+        return fields
+    tokens = [
+        Token(f"{date.text} {clock.text}", "stamp", date.parts + clock.parts)
+        for date, clock in zip(dates[0].tokens, clocks[0].tokens, strict=True)
+    ]
+    values = tuple(sum(token.parts) for token in tokens)
+    dated = clocks[0]._replace(values=values, tokens=tuple(tokens), pattern=None)
+    return [dated, *(field for field in fields if field not in (*dates, *clocks))]
+
+
 def _merged(fields: list[Field]) -> list[Field]:
     """Without fields that say the same again, such as a folder's number in the names of its files."""
     kept: dict[Times, Field] = {}
     for field in fields:
         first, last = min(field.values), max(field.values)
-        key = tuple((value - first) / (last - first) for value in field.values)
+        key = tuple(Fraction(value - first, last - first) for value in field.values)
         same = kept.get(key)
         kept[key] = same._replace(words=same.words | field.words) if same else field
     return list(kept.values())
@@ -159,8 +179,12 @@ def _reading(names: Sequence[str], field: Field) -> Reading:
         midnight = next((two for one, two in pairwise(ordered) if two - one > DAY // 2), None)
         if midnight is not None:
             times = tuple(time + DAY * (time < midnight) for time in times)
-    finds = re.compile(field.pattern).search
     texts = tuple(token.text for token in field.tokens)
-    is_found = all((match := finds(name)) and match[1] == text for name, text in zip(names, texts, strict=True))
-    is_photo = field.is_called(PHOTO_WORDS) and not _is_stamp(field)
-    return Reading(times, texts, field.pattern if is_found else None, is_photo)
+    pattern = field.pattern if field.pattern and _finds(field.pattern, names, texts) else None
+    called = "camera" if field.is_called(CAMERA_WORDS) else "photograph" if field.is_called(PHOTO_WORDS) else None
+    return Reading(times, texts, pattern, None if _is_stamp(field) else called)
+
+
+def _finds(pattern: str, names: Sequence[str], texts: Sequence[str]) -> bool:
+    found = [re.search(pattern, name) for name in names]
+    return [match and match[1] for match in found] == list(texts)

@@ -4,7 +4,6 @@ import re
 from collections import Counter
 from collections.abc import Hashable
 from dataclasses import replace
-from fractions import Fraction
 from itertools import pairwise
 from pathlib import Path
 
@@ -79,13 +78,13 @@ def _from_names(frames: list[Frame], folder: Path, time_from: str) -> tuple[dict
             times = times_in_order(names)
         elif time_from == NAMES:
             reading = _only_reading(names, frames, folder)
-            times = reading.times if reading else [Fraction(0)] * len(names)
-            warnings = [_photo_numbers(reading)] if reading and reading.is_photo_number else []
+            times = reading.times if reading else (0,) * len(names)
+            warnings = [_photographs(reading)] if reading and reading.called == "photograph" else []
         else:
             times = times_by_pattern(names, re.compile(time_from))
     except NameWithoutTime as error:
-        by = "has no number where others have one" if time_from == NAMES else f"has no time where {time_from} says"
-        raise DatasetInvalid(folder, error.args[0], f"{by}: {OTHERS}") from None
+        problem = "has no number that gives its time" if time_from == NAMES else f"has no time where '{time_from}' says"
+        raise DatasetInvalid(folder, error.args[0], f"{problem}; {OTHERS}") from None
     first, last = min(times), max(times)
     unit = [float((time - first) / ((last - first) or 1)) for time in times]
     return dict(zip(paths, unit, strict=True)), warnings
@@ -93,10 +92,26 @@ def _from_names(frames: list[Frame], folder: Path, time_from: str) -> tuple[dict
 
 def _only_reading(names: list[str], frames: list[Frame], folder: Path) -> Reading | None:
     """The numbers that are the times; None if all names have the same numbers."""
-    found = readings(names, [_pose(frame) for frame in frames], [_lens(frame) for frame in frames])
+    poses = [_pose(frame) for frame in frames]
+    found = readings(names, poses, [_lens(frame) for frame in frames])
     if len(found) > 1:
-        raise DatasetInvalid(folder, "names of images", f"{_ambiguity(names, found)}; {OTHERS}")
+        problem = f"have several numbers that may be the time: {_examples(names, found)}"
+        raise DatasetInvalid(folder, "names of images", f"{problem}; {OTHERS}")
+    if found and found[0].called == "camera" and len(set(poses)) == len(poses):
+        problem = f"have the number of a camera, but none of a time: {_examples(names, found)}"
+        raise DatasetInvalid(folder, "names of images", f"{problem}; {OTHERS}")
     return found[0] if found else None
+
+
+def _examples(names: list[str], found: list[Reading]) -> str:
+    """Three names, and the time of each in the readings."""
+    order = sorted(range(len(names)), key=lambda i: natural_order(names[i]))
+    shown = sorted({order[0], order[1], order[-1]}, key=order.index)
+    read = []
+    for reading in found:
+        option = f" with --time-from '{reading.pattern}'" if reading.pattern else ""
+        read.append(", ".join(reading.texts[i] for i in shown) + option)
+    return f"{', '.join(names[i] for i in shown)} would be at {', or at '.join(read)}"
 
 
 def _pose(frame: Frame) -> bytes:
@@ -121,15 +136,15 @@ def _ambiguity(names: list[str], found: list[Reading]) -> str:
 
 def _equal(frames: list[Frame]) -> str:
     return (
-        f"All {len(frames)} images have the same time, so the scene is trained as one that stands still: if it moves, "
-        f"take the times from the files' names with --time-from {NAMES}, or from their order with --time-from {INDEX}."
+        f"all {len(frames)} images have the same time, so the scene is trained as one that stands still: if it moves, "
+        f"take the times from the files' names with --time-from {NAMES}, or from their order with --time-from {INDEX}"
     )
 
 
-def _photo_numbers(reading: Reading) -> str:
+def _photographs(reading: Reading) -> str:
     return (
-        f"Times are the numbers of photographs, {reading.texts[0]} to {reading.texts[-1]}, whatever time passed "
-        f"between them: choose --time-from {NONE} for a scene that stands still."
+        f"times are the numbers of photographs, {reading.texts[0]} to {reading.texts[-1]}, whatever time passed "
+        f"between them: choose --time-from {NONE} for a scene that stands still"
     )
 
 
@@ -141,7 +156,7 @@ def _repeated(frames: list[Frame]) -> list[str]:
     copies = [frame.name for frame in frames if (_pose(frame), frame.t) == shot]
     warning = (
         f"{shots.total() - len(shots)} of {len(frames)} images have the pose and the time of another one, such as "
-        f"{copies[0]} and {copies[1]}: remove copies, or choose other times with --time-from."
+        f"{copies[0]} and {copies[1]}: remove copies, or choose other times with --time-from"
     )
     return [warning]
 
@@ -158,6 +173,6 @@ def _outlying(frames: list[Frame], times: list[float]) -> list[str]:
     warning = (
         f"{len(few)} of {len(frames)} images, such as {few[0].name} at t = {few[0].t:g}, are far in time from the "
         f"others at t = {min(others):g} to {max(others):g}: remove them, correct their times, or choose other times "
-        "with --time-from."
+        "with --time-from"
     )
     return [warning]
