@@ -49,10 +49,10 @@ class BenchScene:
     folder: Path
     size: int
     llffhold: int = 0
-    time_from: str | None = None
     splits: tuple[str, ...] = SPLITS
     short: bool = False
     """Whether it is trained on without `--whole`."""
+    time_from: str | None = None
 
 
 def read_scenes(data: Path, *, short: bool, names: Sequence[str] = (), file: Path = SCENES) -> list[BenchScene]:

@@ -35,8 +35,8 @@ FORMS = {
 """A pattern for each form of a number; the first that matches counts."""
 
 MIXABLE = ({"stamp_fraction", "stamp"}, {"decimal", "number"})
-STAMPS = {"stamp_fraction", "stamp", "epoch"}
-CAMERA_WORDS = re.compile(r"(?:.*cam|.*camera|view|gopro|kinect|sensor|lens|device)s?")
+STAMPS = {"stamp_fraction", "stamp", "epoch", "clock"}
+CAMERA_WORDS = re.compile(r"(?:.*cam|.*camera|view|gopro|kinect|sensor|lens|device|c)s?")
 TIME_WORDS = re.compile(r"(?:.*frame|frm|fr|f|.*time|.*timestamp|ts|t|sec|second|ms)s?")
 EXTENSION = re.compile(r"\.[A-Za-z]\w*$")
 
@@ -74,9 +74,14 @@ class Field(NamedTuple):
     texts: tuple[tuple[str, ...], ...]  # of the folder or stem that it is in
     pattern: str | None  # a regular expression that finds it in the first name, as its group
 
+    @property
+    def is_stamp(self) -> bool:
+        """Whether it is a date, a clock or an epoch."""
+        return self.tokens[0].form in STAMPS
+
     def is_called(self, pattern: re.Pattern[str]) -> bool:
-        """Whether a word before the number is of a kind."""
-        return any(pattern.fullmatch(word) for word in self.words)
+        """Whether it is a mere number after a word of a kind."""
+        return not self.is_stamp and any(pattern.fullmatch(word) for word in self.words)
 
 
 def read_fields(names: Sequence[str]) -> list[Field]:
@@ -173,7 +178,7 @@ def _words(row: list[Component], place: int, index: int) -> list[str]:
     if index == 0 and not before and len(row) > -place:
         before = row[place - 1].texts[-1]
     words = re.findall(r"[^\W\d_]+", before.lower())
-    has_meaning = words and (len(words[-1]) > 1 or words[-1] in "ft")
+    has_meaning = words and (len(words[-1]) > 1 or words[-1] in "cft")
     return words[-1:] if has_meaning else words[-2:-1]
 
 

@@ -15,7 +15,6 @@ from msdgs_train.datasets.common.name_fields import (
     CAMERA_WORDS,
     DAY,
     EXTENSION,
-    STAMPS,
     TIME_WORDS,
     Field,
     Number,
@@ -47,15 +46,15 @@ class NameWithoutTime(Exception):
 
 
 def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[Hashable]) -> list[Reading]:
-    """The likely times of names; several readings if they are ambiguous, none if no number varies.
+    """The likely times of names; several readings if they are ambiguous, none if no number varies but a camera's.
 
     `poses` are equal for images taken from the same place, `lenses` for those that may be of the same camera. Raises
     `NameWithoutTime`.
     """
-    fields = read_fields(names)
-    if not fields and len(names) > 1:
+    everywhere = read_fields(names)
+    if not everywhere and len(names) > 1:
         raise NameWithoutTime(next((name for name in names if not re.search(r"\d[^/]*$", name)), names[0]))
-    fields = _dated([field for field in fields if len(set(field.values)) > 1])
+    fields = _dated([field for field in everywhere if len(set(field.values)) > 1])
     steps = (
         _merged,
         _without_labels,
@@ -67,7 +66,13 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
     for step in steps:
         if len(fields) > 1:
             fields = step(fields) or fields
-    return [_reading(names, field) for field in fields]
+    found = [_reading(names, field) for field in fields]
+    if [reading.called for reading in found] == ["camera"]:
+        if len(set(poses)) < len(poses):  # one camera, that stands still for a while
+            return [found[0]._replace(called=None)]
+        if len(everywhere) > 1:  # the others are the same in all names
+            return []
+    return found
 
 
 def times_in_order(names: Sequence[str]) -> Times:
@@ -157,7 +162,7 @@ def _named(fields: list[Field]) -> list[Field]:
     """Dates and epochs that vary most, else those that are called times, else those that aren't called cameras."""
     fields = [field for field in fields if not field.is_called(CAMERA_WORDS)] or fields
     most = max(len(set(field.values)) for field in fields)
-    stamps = [field for field in fields if _is_stamp(field) and len(set(field.values)) == most]
+    stamps = [field for field in fields if field.is_stamp and len(set(field.values)) == most]
     if stamps or _may_restart(fields):
         return stamps or fields
     return [field for field in fields if field.is_called(TIME_WORDS)] or fields
@@ -165,11 +170,7 @@ def _named(fields: list[Field]) -> list[Field]:
 
 def _may_restart(fields: list[Field]) -> bool:
     """Whether there is a number or date of recordings, in each of which frames may count anew."""
-    return len(fields) > 1 and any(_is_stamp(field) or field.is_called(RECORDING_WORDS) for field in fields)
-
-
-def _is_stamp(field: Field) -> bool:
-    return field.tokens[0].form in STAMPS
+    return len(fields) > 1 and any(field.is_stamp or field.is_called(RECORDING_WORDS) for field in fields)
 
 
 def _reading(names: Sequence[str], field: Field) -> Reading:
@@ -182,7 +183,7 @@ def _reading(names: Sequence[str], field: Field) -> Reading:
     texts = tuple(token.text for token in field.tokens)
     pattern = field.pattern if field.pattern and _finds(field.pattern, names, texts) else None
     called = "camera" if field.is_called(CAMERA_WORDS) else "photograph" if field.is_called(PHOTO_WORDS) else None
-    return Reading(times, texts, pattern, None if _is_stamp(field) else called)
+    return Reading(times, texts, pattern, called)
 
 
 def _finds(pattern: str, names: Sequence[str], texts: Sequence[str]) -> bool:

@@ -92,12 +92,11 @@ def _from_names(frames: list[Frame], folder: Path, time_from: str) -> tuple[dict
 
 def _only_reading(names: list[str], frames: list[Frame], folder: Path) -> Reading | None:
     """The numbers that are the times; None if all names have the same numbers."""
-    poses = [_pose(frame) for frame in frames]
-    found = readings(names, poses, [_lens(frame) for frame in frames])
+    found = readings(names, [_pose(frame) for frame in frames], [_lens(frame) for frame in frames])
     if len(found) > 1:
         problem = f"have several numbers that may be the time: {_examples(names, found)}"
         raise DatasetInvalid(folder, "names of images", f"{problem}; {OTHERS}")
-    if found and found[0].called == "camera" and len(set(poses)) == len(poses):
+    if found and found[0].called == "camera":
         problem = f"have the number of a camera, but none of a time: {_examples(names, found)}"
         raise DatasetInvalid(folder, "names of images", f"{problem}; {OTHERS}")
     return found[0] if found else None

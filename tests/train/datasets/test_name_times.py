@@ -208,6 +208,7 @@ def test_copies_with_a_number_of_their_own_are_ambiguous():
 def test_equal_numbers_are_no_times(spell: str):
     assert read([spell]) == []
     assert read(["left_1.png", "right_1.png"]) == []
+    assert read(["c1/0005.png", "c2/0005.png"]) == read(["frame_3/cam1.png", "frame_3/cam2.png"]) == []
 
 
 @pytest.mark.parametrize(
