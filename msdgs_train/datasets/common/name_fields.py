@@ -14,8 +14,12 @@ from fractions import Fraction
 from operator import mul
 from typing import NamedTuple
 
+YEAR, MONTH, DAY_OF_MONTH = r"(?:19|20)\d\d", r"(?:0[1-9]|1[0-2])", r"(?:0[1-9]|[12]\d|3[01])"
 HOUR, SIXTY = r"(?:[01]\d|2[0-3])", r"[0-5]\d"
-DATE = r"(?<!\d)(?:19|20)\d\d(?P<{0}>[-_.:]?)(?:0[1-9]|1[0-2])(?P={0})(?:0[1-9]|[12]\d|3[01])"
+DATE = (
+    rf"(?<!\d)(?:{YEAR}(?P<{{0}}>[-_.:]?){MONTH}(?P={{0}}){DAY_OF_MONTH}"
+    rf"|{DAY_OF_MONTH}(?P<{{0}}b>[-_.]){MONTH}(?P={{0}}b){YEAR})"
+)
 BETWEEN = r"(?:[-_.]*T?[-_.]*|[-_.\s]+|\s+at\s+)"
 CLOCK = rf"(?:{HOUR}(?P<{{0}}>[-_.:]?){SIXTY}(?P={{0}}){SIXTY}|{HOUR}h{SIXTY}m{SIXTY})"
 MINUTES = rf"{HOUR}[-_.:h]?{SIXTY}"
@@ -37,7 +41,8 @@ FORMS = {
 MIXABLE = ({"stamp_fraction", "stamp"}, {"decimal", "number"})
 STAMPS = {"stamp_fraction", "stamp", "epoch", "clock"}
 CAMERA_WORDS = re.compile(r"(?:.*cam|.*camera|view|gopro|kinect|sensor|lens|device|c)s?")
-TIME_WORDS = re.compile(r"(?:.*frame|frm|fr|f|.*time|.*timestamp|ts|t|sec|second|ms)s?")
+FRAME_WORDS = re.compile(r"(?:.*frame|frm|fr|f)s?")
+TIME_WORDS = re.compile(r"(?:.*time|.*timestamp|ts|t|sec|second|ms)s?")
 EXTENSION = re.compile(r"\.[A-Za-z]\w*$")
 
 
@@ -138,6 +143,8 @@ def _parts(form: str, text: str) -> tuple[Number, ...]:
     digits = re.sub(r"\D", "", text)
     if form == "epoch":
         return (Fraction(int(digits), 10 ** (len(digits) - 10)),)
+    if re.match(r"\d\d\D", text) and form != "clock":  # day, month, year
+        digits = digits[4:8] + digits[2:4] + digits[:2] + digits[8:]
     days = 0
     if form != "clock":
         try:
@@ -150,7 +157,9 @@ def _parts(form: str, text: str) -> tuple[Number, ...]:
     if half in ("am", "pm"):
         hours = hours % 12 + 12 * (half == "pm")
     minutes = DAY * days + 3600 * hours + 60 * int(digits[2:4])
-    return (minutes, seconds + fraction) if form == "clock" else (minutes + seconds, fraction)
+    if form == "stamp_fraction":
+        return minutes + seconds, fraction
+    return (minutes, seconds + fraction) if form == "clock" else (minutes + seconds + fraction,)
 
 
 def _fields(rows: list[list[Component]]) -> Iterator[Field]:
@@ -228,7 +237,7 @@ def _unsound_form(field: Field) -> str | None:
     if form == "clock" and all(re.match(r"00\d{4}", token.text) for token in field.tokens):  # a number of six digits
         return form
     if form == "decimal":
-        if field.is_called(TIME_WORDS):
+        if field.is_called(TIME_WORDS) or field.is_called(FRAME_WORDS):
             return None
         fractions = [re.sub(r"-?\d+[.,]?", "", token.text, count=1) for token in field.tokens]
         counts_on = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)

@@ -15,6 +15,7 @@ from msdgs_train.datasets.common.name_fields import (
     CAMERA_WORDS,
     DAY,
     EXTENSION,
+    FRAME_WORDS,
     TIME_WORDS,
     Field,
     Number,
@@ -26,7 +27,7 @@ from msdgs_train.datasets.common.name_fields import (
 
 PHOTO_WORDS = re.compile(r"img|dsc[nf]?|mg|imgp|sam|dji|gopr|photo|pict?")
 """Words before the numbers that a camera gives to its photographs."""
-RECORDING_WORDS = re.compile(r"(?:take|clip|part|chapter|video|vid|shot|seq|sequence|session|rec|g[xhls]|mvi)s?")
+RECORDING_WORDS = re.compile(r"(?:take|clip|scene|part|chapter|video|vid|shot|seq|sequence|session|rec|g[xhls]|mvi)s?")
 """Words before the number of a recording. If it varies, frames may count anew in each."""
 
 Times = tuple[Number, ...]
@@ -159,13 +160,14 @@ def _grows_with(field: Field, other: Field) -> bool:
 
 
 def _named(fields: list[Field]) -> list[Field]:
-    """Dates and epochs that vary most, else those that are called times, else those that aren't called cameras."""
+    """Dates, clocks and epochs that vary most; else what is called a time, a frame, or at least no camera."""
     fields = [field for field in fields if not field.is_called(CAMERA_WORDS)] or fields
     most = max(len(set(field.values)) for field in fields)
     stamps = [field for field in fields if field.is_stamp and len(set(field.values)) == most]
     if stamps or _may_restart(fields):
         return stamps or fields
-    return [field for field in fields if field.is_called(TIME_WORDS)] or fields
+    times, frames = ([field for field in fields if field.is_called(words)] for words in (TIME_WORDS, FRAME_WORDS))
+    return times or frames or fields
 
 
 def _may_restart(fields: list[Field]) -> bool:

@@ -17,6 +17,7 @@ from msdgs_train.datasets.common.name_times import (
 )
 
 CAMERAS, FRAMES = 3, 14
+GRID = list(product(range(CAMERAS), range(FRAMES)))
 SECONDS = [7 * index for index in range(FRAMES)]
 """Seconds over two minutes, at irregular places in them."""
 
@@ -71,6 +72,8 @@ ONE_CAMERA: dict[str, Callable[[int], str]] = {
     "photograph beside": lambda i: f"{i:04}_IMG_{4711 + i * i}",
     "hashes of digits": lambda i: f"frame_{i:04}-3f2",
     "two numbers as one": lambda i: f"{i:04}/{i:04}_rgb",
+    "frame and seconds": lambda i: f"frame_{i:04}_t{i / 8:.3f}",
+    "index and milliseconds": lambda i: f"{i:06}_{1706745599900 + 33 * i}",
     "dates": lambda i: f"2024-01-{10 + i:02}",
 }
 
@@ -100,6 +103,9 @@ CLOCKS = (
     "{Y}-{m:02}-{d:02}/{H:02}-{M:02}-{S:02}",
     "{Y}{m:02}{d:02}/{H:02}{M:02}{S:02}",
     "cam_{H:02}{M:02}{S:02}_x2",
+    "{d:02}-{m:02}-{Y}_{H:02}-{M:02}-{S:02}",
+    "{d:02}.{m:02}.{Y} {H:02}.{M:02}.{S:02}",
+    "DJI_{Y}{m:02}{d:02}{H:02}{M:02}{S:02}_0001_V",
     "{H:02}-{M:02}-{S:02}",
     "{H:02}h{M:02}m{S:02}s",
     "video_{H:02}:{M:02}:{S:02}.500",
@@ -118,6 +124,11 @@ def test_fractions_of_seconds_count():
     assert since_first(reading) == [i / 4 for i in range(FRAMES)]
     names = [clock(i // 4, "{H:02}-{M:02}-{S:02}", 0, 1) + f".{i % 4 * 250:03}.jpg" for i in range(FRAMES)]
     assert since_first(read(names)[0]) == [i / 4 for i in range(FRAMES)]
+
+
+def test_cameras_need_not_be_synchronous():
+    names = [clock(i, f"cam{c}/{{Y}}-{{m:02}}-{{d:02}}T{{H:02}}-{{M:02}}-{{S:02}}.{c}50.png") for c, i in GRID]
+    assert since_first(read(names)[0]) == pytest.approx([i + c / 10 for c, i in GRID])
 
 
 def test_copies_of_a_name_in_the_same_second_share_its_time():
@@ -147,9 +158,11 @@ SEVERAL_CAMERAS: dict[str, Callable[[int, int], str]] = {
     "clock": lambda c, i: clock(i, f"cam{c}_{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}"),
     "clock and number": lambda c, i: clock(i, f"{c}_{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}"),
     "clock, then number": lambda c, i: clock(i, f"{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}_00{c}"),
+    "letters before numbers": lambda c, i: f"C{c:04}_F{i:05}",
+    "dot before the camera": lambda c, i: f"{i:06}.cam{c}",
+    "constant rig": lambda c, i: f"rig1_cam{c}_time{i}_x2",
     "scale suffix": lambda c, i: f"cam{c}/{i:04}_x2",
 }
-GRID = list(product(range(CAMERAS), range(FRAMES)))
 
 
 @pytest.mark.parametrize("spell", SEVERAL_CAMERAS.values(), ids=SEVERAL_CAMERAS)
@@ -188,6 +201,7 @@ def test_cameras_decide_where_names_alone_are_ambiguous(spell: Callable[[int, in
 
 
 UNDECIDED = {
+    "frames of several scenes": lambda c, i: f"scene{c}/frame_{i:04}",
     "frames of several takes": lambda c, i: f"take{c}_frame_{i:04}",
     "chapters of a camera": lambda c, i: f"GX0{c + 1}0023_{i:06}",
     "clips with their start": lambda c, i: clock(60 * c, "{Y}{m:02}{d:02}_{H:02}{M:02}00") + f"_frame_{i:04}",
