@@ -103,16 +103,16 @@ def read_fields(names: Sequence[str]) -> list[Field]:
         forms.remove(unsound[0])
 
 
-def parse_value(text: str) -> Number | None:
-    """The number, date and clock, or clock that a text is, in seconds if it is not a mere number; None if it is none.
+def read_values(texts: Sequence[str]) -> list[Number | None]:
+    """The number, date or clock that each text is, in seconds if it is not a mere number; None if it is none.
 
-    Unlike in a name, `_` and `:` may separate hours, minutes and seconds, and hours may be left out.
+    Unlike in names, `_` may separate hours, minutes and seconds, and hours may be left out.
     """
-    for form, pattern in FORMS.items():
-        if re.fullmatch(pattern, text):
-            return sum(parts) if (parts := _parts(form, text)) else None
-    clock = re.fullmatch(r"(?:(\d+)[-_:.h])?(\d+)[-_:m](\d+(?:\.\d+)?)s?", text)
-    return sum(map(mul, map(Fraction, clock.groups("0")), (3600, 60, 1))) if clock else None
+    fields = read_fields(texts)
+    if len(fields) == 1 and all(token.text == text for token, text in zip(fields[0].tokens, texts, strict=True)):
+        return list(fields[0].values)
+    clocks = [re.fullmatch(r"(?:(?:(\d+)[-_:.h])?(\d+)[-_:m])?(\d+(?:\.\d+)?)s?", text) for text in texts]
+    return [clock and sum(map(mul, map(Fraction, clock.groups("0")), (3600, 60, 1))) for clock in clocks]
 
 
 def natural_order(name: str) -> list[tuple[int, str]]:

@@ -21,14 +21,14 @@ from msdgs_train.datasets.common.name_fields import (
     Number,
     Token,
     natural_order,
-    parse_value,
     read_fields,
+    read_values,
 )
 
 PHOTO_WORDS = re.compile(r"img|dsc[nf]?|mg|imgp|sam|dji|gopr|photo|pict?")
-"""Words before the numbers that a camera gives to its photographs."""
+"""Words before the numbers that a camera gives to its photos."""
 RECORDING_WORDS = re.compile(r"(?:take|clip|scene|part|chapter|video|vid|shot|seq|sequence|session|rec|g[xhls]|mvi)s?")
-"""Words before the number of a recording. If it varies, frames may count anew in each."""
+"""Words before the number of a recording. If it varies, frames may start again in each."""
 
 Times = tuple[Number, ...]
 
@@ -39,7 +39,7 @@ class Reading(NamedTuple):
     times: Times  # in the unit of the names
     texts: tuple[str, ...]  # the times as the names have them
     pattern: str | None  # a regular expression that finds them, if a simple one does
-    called: Literal["camera", "photograph"] | None  # what the words before the number say, if not a time
+    called: Literal["camera", "photo"] | None  # what the words before the number say, if not a time
 
 
 class NameWithoutTime(Exception):
@@ -85,15 +85,13 @@ def times_in_order(names: Sequence[str]) -> Times:
 
 def times_by_pattern(names: Sequence[str], expression: re.Pattern[str]) -> Times:
     """The numbers, dates and clocks that `time_group` finds. Raises `NameWithoutTime`."""
+    found = [expression.search(name) for name in names]
     group = time_group(expression)
-    times = []
-    for name in names:
-        match = expression.search(name)
-        time = parse_value(match[group] or "") if match and group else None
+    times = read_values([match[group] or "" if match and group else "" for match in found])
+    for name, time in zip(names, times, strict=True):
         if time is None:
             raise NameWithoutTime(name)
-        times.append(time)
-    return tuple(times)
+    return tuple(time for time in times if time is not None)
 
 
 def time_group(expression: re.Pattern[str]) -> str | int | None:
@@ -141,7 +139,7 @@ def _without_repeats(fields: list[Field], cameras: Sequence[Hashable]) -> list[F
 
 def _finest(fields: list[Field]) -> list[Field]:
     """Without those that another one refines, such as the part of a video by frames that count on; and without a
-    photograph's number beside another one in the same order."""
+    photo's number beside another one in the same order."""
     return [
         field
         for field in fields
@@ -171,7 +169,7 @@ def _named(fields: list[Field]) -> list[Field]:
 
 
 def _may_restart(fields: list[Field]) -> bool:
-    """Whether there is a number or date of recordings, in each of which frames may count anew."""
+    """Whether there is a number or date of recordings, in each of which frames may start again."""
     return len(fields) > 1 and any(field.is_stamp or field.is_called(RECORDING_WORDS) for field in fields)
 
 
@@ -184,7 +182,7 @@ def _reading(names: Sequence[str], field: Field) -> Reading:
             times = tuple(time + DAY * (time < midnight) for time in times)
     texts = tuple(token.text for token in field.tokens)
     pattern = field.pattern if field.pattern and _finds(field.pattern, names, texts) else None
-    called = "camera" if field.is_called(CAMERA_WORDS) else "photograph" if field.is_called(PHOTO_WORDS) else None
+    called = "camera" if field.is_called(CAMERA_WORDS) else "photo" if field.is_called(PHOTO_WORDS) else None
     return Reading(times, texts, pattern, called)
 
 

@@ -79,7 +79,7 @@ def _from_names(frames: list[Frame], folder: Path, time_from: str) -> tuple[dict
         elif time_from == NAMES:
             reading = _only_reading(names, frames, folder)
             times = reading.times if reading else (0,) * len(names)
-            warnings = [_photographs(reading)] if reading and reading.called == "photograph" else []
+            warnings = [_photos(reading)] if reading and reading.called == "photo" else []
         else:
             times = times_by_pattern(names, re.compile(time_from))
     except NameWithoutTime as error:
@@ -122,17 +122,6 @@ def _lens(frame: Frame) -> Hashable:
     return camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, frame.distortion
 
 
-def _ambiguity(names: list[str], found: list[Reading]) -> str:
-    order = sorted(range(len(names)), key=lambda i: natural_order(names[i]))
-    shown = sorted({order[0], order[1], order[-1]}, key=order.index)
-    read = []
-    for reading in found:
-        option = f" with --time-from '{reading.pattern}'" if reading.pattern else ""
-        read.append(", ".join(reading.texts[i] for i in shown) + option)
-    examples = ", ".join(names[i] for i in shown)
-    return f"have several numbers that may be the time: {examples} are at {', or at '.join(read)}"
-
-
 def _equal(frames: list[Frame]) -> str:
     return (
         f"all {len(frames)} images have the same time, so the scene is trained as one that stands still: if it moves, "
@@ -140,9 +129,9 @@ def _equal(frames: list[Frame]) -> str:
     )
 
 
-def _photographs(reading: Reading) -> str:
+def _photos(reading: Reading) -> str:
     return (
-        f"times are the numbers of photographs, {reading.texts[0]} to {reading.texts[-1]}, whatever time passed "
+        f"times are the numbers of photos, {reading.texts[0]} to {reading.texts[-1]}, whatever time passed "
         f"between them: choose --time-from {NONE} for a scene that stands still"
     )
 

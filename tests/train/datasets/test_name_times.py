@@ -69,7 +69,7 @@ ONE_CAMERA: dict[str, Callable[[int], str]] = {
     "seconds since 1970": lambda i: f"rgb/{1706745599 + i / 16:.6f}",
     "two parts since 1970": lambda i: f"{1706745599 + i // 4}_{i % 4 * 250000000:09}",
     "part of a video": lambda i: f"part{i // 5}_{i:04}",
-    "photograph beside": lambda i: f"{i:04}_IMG_{4711 + i * i}",
+    "photo beside": lambda i: f"{i:04}_IMG_{4711 + i * i}",
     "hashes of digits": lambda i: f"frame_{i:04}-3f2",
     "two numbers as one": lambda i: f"{i:04}/{i:04}_rgb",
     "frame and seconds": lambda i: f"frame_{i:04}_t{i / 8:.3f}",
@@ -210,7 +210,7 @@ UNDECIDED = {
 
 
 @pytest.mark.parametrize("spell", UNDECIDED.values(), ids=UNDECIDED)
-def test_frames_that_may_count_anew_are_ambiguous(spell: Callable[[int, int], str]):
+def test_frames_that_may_start_again_are_ambiguous(spell: Callable[[int, int], str]):
     assert len(read([f"{spell(*pair)}.png" for pair in GRID])) == 2
 
 
@@ -225,10 +225,8 @@ def test_equal_numbers_are_no_times(spell: str):
     assert read(["c1/0005.png", "c2/0005.png"]) == read(["frame_3/cam1.png", "frame_3/cam2.png"]) == []
 
 
-@pytest.mark.parametrize(
-    ("spell", "called"), [("IMG_{:04}", "photograph"), ("_DSC{}", "photograph"), ("cam{}", "camera")]
-)
-def test_numbers_of_cameras_and_photographs_are_called_so(spell: str, called: str):
+@pytest.mark.parametrize(("spell", "called"), [("IMG_{:04}", "photo"), ("_DSC{}", "photo"), ("cam{}", "camera")])
+def test_numbers_of_cameras_and_photos_are_called_so(spell: str, called: str):
     assert [reading.called for reading in read([spell.format(12 + index) for index in range(4)])] == [called]
 
 
@@ -245,6 +243,13 @@ def test_a_name_without_a_number_is_named():
 def test_a_pattern_finds_numbers_and_clocks(text: str, seconds: float):
     assert times_by_pattern([f"cam_{text}_x2"], re.compile("cam_(.*)_x2")) == (Fraction(seconds),)
     assert times_by_pattern([f"7_{text}"], re.compile("(.)_(?P<time>.*)")) == (Fraction(seconds),)
+
+
+def test_a_pattern_reads_all_names_alike():
+    names = [f"f_{20 * index:06}.png" for index in range(20)]  # some, but not all, are clocks
+    assert times_by_pattern(names, re.compile(r"f_(\d+)")) == tuple(20 * index for index in range(20))
+    names = ["59.jpg", "01_00.jpg", "01_01.5.jpg"]
+    assert times_by_pattern(names, re.compile(r"(.*)\.jpg")) == (59, 60, 61.5)
 
 
 @pytest.mark.parametrize("name", ["frame_x", "frame_", "other_1"])

@@ -196,9 +196,9 @@ def test_times_far_from_all_others_are_warned_about(tmp_path: Path, times: tuple
 
 
 @pytest.mark.parametrize("form", ["IMG_{:04}", "DSC{:05}", "_DSC{}", "DSCF{:04}", "_MG_{:04}", "DJI_{:04}"])
-def test_numbers_of_photographs_are_warned_about(tmp_path: Path, form: str):
+def test_numbers_of_photos_are_warned_about(tmp_path: Path, form: str):
     scene = colmap(tmp_path, *(f"{form.format(number)}.png" for number in (998, 999, 1001)))
-    assert "numbers of photographs" in warning_of(scene)
+    assert "numbers of photos" in warning_of(scene)
     assert "--time-from none" in warning_of(scene)
 
 
