@@ -22,7 +22,7 @@ from msdgs_train.systems.registry import DEFAULT, preset, systems
 HELP_ALL = "--help-all"
 COMMON = {
     "run": ("steps", "batch_size", "threads", "device", "minutes", "seed"),
-    "data": ("size", "background"),
+    "data": ("size", "time_from", "background"),
     "density": ("init_num_pts", "max_gaussians"),
     "model": ("layers", "support", "sh_degree", "embedding_dim"),
 }

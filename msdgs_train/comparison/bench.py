@@ -52,6 +52,7 @@ class BenchScene:
     splits: tuple[str, ...] = SPLITS
     short: bool = False
     """Whether it is trained on without `--whole`."""
+    time_from: str | None = None
 
 
 def read_scenes(data: Path, *, short: bool, names: Sequence[str] = (), file: Path = SCENES) -> list[BenchScene]:
@@ -79,7 +80,7 @@ def make_bench_runs(
     return [
         Run(name, scene.name, seed, scene.folder.resolve(),
             out / name / "_".join([scene.name, str(seed), *filter(None, _budget(config)), _digest(config)]),
-            config.updated(seed=seed, size=scene.size, llffhold=scene.llffhold))
+            config.updated(seed=seed, size=scene.size, llffhold=scene.llffhold, time_from=scene.time_from))
         for seed in seeds
         for scene in scenes
         for name, config in systems.items()
@@ -106,6 +107,7 @@ def _digest(config: TrainConfig) -> str:
     """Eight digits that change with any setting besides those of `KEY`, the scene's and the machine's."""
     same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1, time="wall")
     groups = same.to_dict()
+    del groups["data"]["time_from"]  # the scene's
     if config.run.device == "cpu":
         del groups["run"]["device"]  # only another device changes the digest
     return hashlib.sha256(json.dumps(groups, sort_keys=True).encode()).hexdigest()[:8]

@@ -26,6 +26,8 @@ class Budget:
     """Length of each run, counted as --time says, instead of --steps."""
     size: int | None = None
     """Width of all images in pixels."""
+    time_from: str | None = None
+    """Where the times of all images come from, as in `fit`."""
     init_num_pts: int | None = None
     """Initial Gaussians of all systems; their own settings if not given."""
     max_gaussians: int | None = None
@@ -41,7 +43,9 @@ class Budget:
         if self.steps is not None:
             every = max(self.steps // EVALUATIONS, 1)
             given |= {"eval_every": every, "checkpoint_every": every, "log_every": max(self.steps // LOG_LINES, 1)}
-        optional = {name: getattr(self, name) for name in ("steps", "size", "init_num_pts", "max_gaussians")}
+        optional = {
+            name: getattr(self, name) for name in ("steps", "size", "time_from", "init_num_pts", "max_gaussians")
+        }
         return given | {name: value for name, value in optional.items() if value is not None}
 
 

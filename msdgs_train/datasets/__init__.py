@@ -7,6 +7,7 @@ from msdgs_train.datasets.colmap.loader import SPARSE, load_colmap
 from msdgs_train.datasets.common.images import composite
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame, SceneData
+from msdgs_train.datasets.common.times import NAMES, timed
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
 from msdgs_train.datasets.hypernerf import DATASET_FILE, load_hypernerf
 from msdgs_train.datasets.nerfstudio import TRANSFORMS_FILE, load_nerfstudio
@@ -24,19 +25,21 @@ LAYOUTS = (
 """Name, marker file and reader of each layout; COLMAP is tried last, since other layouts contain its files too."""
 
 
-def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0) -> SceneData:
+def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0, time_from: str | None = None) -> SceneData:
     """Read the dataset in folder `path`, detecting its layout.
 
-    `size` is the width in pixels that images are reduced to, height in proportion; `llffhold` that of `DataConfig`.
-    Times are in [0, 1]. Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and
-    `InvalidInput` for an unusable `size` or `llffhold`.
+    `size` is the width in pixels that images are reduced to, height in proportion; `llffhold` and `time_from` are
+    those of `DataConfig`. Times are in [0, 1]. Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid`
+    naming file and field, and `InvalidInput` for an unusable `size`, `llffhold` or `time_from`.
     """
     folder = Path(path)
     if not folder.is_dir():
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
     for layout, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
-            scene = replace(load(folder, size), layout=layout).in_unit_time()
+            own = NAMES if load is load_colmap else None  # COLMAP stores no times
+            read = replace(load(folder, size), layout=layout)
+            scene = timed(read, folder, own if time_from is None else time_from).in_unit_time()
             return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
     raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from msdgs_train.datasets.common.times import EXPECTED, is_time_from
 from msdgs_train.settings import Checked
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -17,6 +18,10 @@ class DataConfig(Checked):
     llffhold: int = 0
     """N: the first training image and every N-th after it are held out for testing, and those halfway between for
     validation, in place of the dataset's splits; if it names none, these are of all images. 0: the dataset's splits."""
+    time_from: str | None = None
+    """Times of the images: `names` takes the number, date or clock in the files' names that varies with time; `index`
+    their order; `none` is a scene that stands still; a regular expression has the time as its group, such as
+    'frame_(\\d+)'. The dataset's own times if not given, `names` for COLMAP."""
     background: Literal["white", "black", "random"] = "white"
     """Color behind the scene; random: another one each step, white in evaluation."""
     scene_half_size: float | None = None
@@ -29,6 +34,7 @@ class DataConfig(Checked):
         )
         self.require_positive_or_none("scene_half_size")
         self.require(("llffhold",), "0, or an integer of 3 or more", lambda v: type(v) is int and (v == 0 or v > 2))
+        self.require(("time_from",), EXPECTED, is_time_from)
         self.require(("background",), f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
 
     @property

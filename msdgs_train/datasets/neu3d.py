@@ -17,6 +17,7 @@ import numpy as np
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
+from msdgs_train.datasets.common.name_fields import natural_order
 from msdgs_train.datasets.common.ply_points import read_ply_points
 from msdgs_train.datasets.common.readers import DatasetInvalid, read_table
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, reduced
@@ -57,7 +58,7 @@ def _find_cameras(folder: Path) -> dict[str, list[Path]]:
     if len(names) < 2:
         problem = f"must be two or more, got {len(names)}: cam00 for testing, cam01 and on for training"
         raise DatasetInvalid(folder, "cameras", problem)
-    return {name: _find_files(folder, name) for name in sorted(names, key=_natural)}
+    return {name: _find_files(folder, name) for name in sorted(names, key=natural_order)}
 
 
 def _find_files(folder: Path, name: str) -> list[Path]:
@@ -65,17 +66,12 @@ def _find_files(folder: Path, name: str) -> list[Path]:
         shown = (path for path in place.glob("*") if not path.name.startswith("."))
         files = [path for path in shown if path.suffix.lower() in EXTENSIONS and path.is_file()]
         if files:
-            return sorted(files, key=lambda path: _natural(path.name))
+            return sorted(files, key=lambda path: natural_order(path.name))
     videos = [path for path in folder.glob(f"{name}.*") if path.suffix.lower() == VIDEO and path.is_file()]
     if not videos:
         problem = f"are missing: there is no {name}{VIDEO} and no {'|'.join(EXTENSIONS)}"
         raise DatasetInvalid(folder / name, "frames", problem)
     return videos[:1]
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Return a sorting key that orders numbers by value, with or without leading zeros."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _view(file: Path, row: int, name: str, files: list[Path], pose: np.ndarray, size: int | None) -> list[Frame]:
@@ -118,7 +114,7 @@ def _camera(file: Path, row: int, values: np.ndarray, image: ImageSize) -> Camer
 
 def _read_points(folder: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
     for pattern in POINTS_FILES:
-        files = sorted(folder.glob(pattern), key=lambda path: _natural(path.stem))
+        files = sorted(folder.glob(pattern), key=lambda path: natural_order(path.stem))
         if files:
             return read_ply_points(files[-1])
     return None, None

@@ -83,7 +83,8 @@ def evaluate_run(
     names = [name for name, file in FILES.items() if name == "last" or (not brief and (run / file).exists())]
     loaded = {name: load_model(run / FILES[name]) for name in names}
     data = _data_folder(run, data)
-    scene = load_scene(data, settings.size, settings.llffhold).in_frame(loaded["last"].scene.placement)
+    scene = load_scene(data, settings.size, settings.llffhold, settings.time_from)
+    scene = scene.in_frame(loaded["last"].scene.placement)
     frames = _frames(scene, data, split)
     region = moving_region(scene, split, list(loaded.values()))
     perceptual = perceptual_metrics(with_flip=not brief)

@@ -12,6 +12,7 @@ from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_serve.scene.similarity import IDENTITY, Similarity
+from msdgs_train.datasets.common.times import EXPECTED, is_time_from
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -37,6 +38,8 @@ class SceneInfo:
     """Width in pixels to which images were reduced, as in `DataConfig`."""
     llffhold: int = 0
     """Every so many images were held out, as in `DataConfig`."""
+    time_from: str | None = None
+    """Where times came from, as in `DataConfig`."""
     scene_to_world: dict[str, Any] = field(default_factory=IDENTITY.to_plain)
     """Plain values of the `Similarity` from the frame of the model, bounds and cameras to the user's world."""
 
@@ -132,6 +135,8 @@ def _refuse_unusable_scene(path: str | Path, scene: SceneInfo) -> None:
         value = getattr(scene, name)
         if type(value) is not int and (name, value) != ("size", None):
             raise CheckpointInvalid(path, f"scene.{name} must be a whole number, got {value!r}")
+    if not is_time_from(scene.time_from):
+        raise CheckpointInvalid(path, f"scene.time_from must be {EXPECTED}, got {scene.time_from!r}")
     for name, shape in (("time_range", (2,)), ("background", (3,)), ("bounds", (2, 3))):
         try:
             values = torch.tensor(getattr(scene, name), dtype=torch.float64)

@@ -152,6 +152,7 @@ class GaussianSplatting:
             size=self.config.data.size,
             llffhold=self.config.data.llffhold,
             scene_to_world=self.scene.scene_to_world.to_plain(),
+            time_from=self.config.data.time_from,
         )
 
     def _options(self, step: int) -> RasterizerOptions:

@@ -3,6 +3,7 @@
 import hashlib
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -163,6 +164,18 @@ def test_images_are_as_wide_as_those_of_the_run(data: Path):
 def test_images_that_the_run_held_out_are_no_training_images(data: Path):
     counts = [len(HeldOutImages(data, SceneInfo(llffhold=n), lambda _: lambda: None).training) for n in (0, 3)]
     assert counts[1] < counts[0]
+
+
+@pytest.mark.parametrize(("time_from", "count"), [(None, 1), ("none", 0)])
+def test_images_have_the_times_of_the_run(data: Path, time_from: str | None, count: int):
+    counts = []
+
+    def begin(count: int) -> Callable[[], None]:
+        counts.append(count)
+        return lambda: None
+
+    HeldOutImages(data, SceneInfo(time_range=(0.5, 1.0), time_from=time_from), begin)
+    assert counts == [count]
 
 
 def test_embeddings_and_their_network_are_gone(scene_file: Path, model: DynamicGaussians):

@@ -4,12 +4,11 @@ Poses map world to camera in OpenCV axes and pixel centers are at half-integers,
 the models SIMPLE_RADIAL, RADIAL and OPENCV are undistorted by `Frame.load_rgba`, bilinearly, to a pinhole camera with
 the same intrinsics. If `images` holds downscaled copies, intrinsics are scaled to them.
 
-COLMAP stores no times: a frame's time is the last number in the image's name, scaled to [0, 1] over the images of the
-model. The first image, in the order of names, and every 8th after it are test frames.
+COLMAP stores no times: `load_scene` takes them from the images' names, and t = 0 here. The first image, in the order of
+names, and every 8th after it are test frames.
 """
 
 import math
-import re
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -26,24 +25,17 @@ from msdgs_train.datasets.common.readers import DatasetInvalid, finite_rows
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, hold_out, reduced
 
 SPARSE = "sparse"
-LAST_NUMBER = re.compile(r"(\d+)\D*$")
 
 
 def load_colmap(folder: Path, size: int | None = None) -> SceneData:
-    """Read the cameras, times and sparse points of a COLMAP scene, as `load_scene` does.
-
-    If all images have the same number in their names, the scene is static, t = 0.
-    """
+    """Read the cameras and sparse points of a COLMAP scene, as `load_scene` does."""
     files = _model_files(folder)
     read = colmap_binary if files[0].suffix == ".bin" else colmap_text
     cameras = dict(read.read_cameras(files[0]))
     images = sorted(read.read_images(files[1]), key=lambda image: image.name)
     if not images:
         raise DatasetInvalid(files[1], "images", "must be one or more")
-    frames = [
-        _frame(folder, files, image, cameras.get(image.camera_id), t, size)
-        for image, t in zip(images, _times(files[1], images), strict=True)
-    ]
+    frames = [_frame(folder, files, image, cameras.get(image.camera_id), size) for image in images]
     points, colors = _points(files[2], list(read.read_points(files[2])))
     half_size = scene_half_size(points, [frame.camera for frame in frames])
     return SceneData(hold_out(frames), half_size, points, colors, unsplit=frames)
@@ -62,9 +54,7 @@ def _model_files(folder: Path) -> list[Path]:
     raise DatasetInvalid(folder / SPARSE, "cameras", "is missing: there is no cameras.bin or cameras.txt, here or in 0")
 
 
-def _frame(
-    folder: Path, files: list[Path], image: ModelImage, camera: ModelCamera | None, t: float, size: int | None
-) -> Frame:
+def _frame(folder: Path, files: list[Path], image: ModelImage, camera: ModelCamera | None, size: int | None) -> Frame:
     field = f"images[{image.name}]"
     if camera is None:
         raise DatasetInvalid(files[1], field, f"has camera {image.camera_id}, which is not in {files[0].name}")
@@ -78,7 +68,7 @@ def _frame(
     distortion = Distortion(**{key: camera.values.get(key, 0.0) for key in Distortion._fields})
     distortion = checked_distortion(distortion, pinhole, files[0], f"cameras[{image.camera_id}]")
     name = "_".join(PurePosixPath(image.name).with_suffix("").parts)
-    return Frame(name, reduced(pinhole, size, image_path), t, image_path, distortion)
+    return Frame(name, reduced(pinhole, size, image_path), 0.0, image_path, distortion)
 
 
 def _pinhole(files: list[Path], image: ModelImage, camera: ModelCamera) -> Camera:
@@ -104,18 +94,6 @@ def _camera_to_world(file: Path, image: ModelImage) -> np.ndarray:
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -rotation.T @ image.tvec
     return pose
-
-
-def _times(file: Path, images: list[ModelImage]) -> list[float]:
-    """Return the time of each image, in [0, 1]."""
-    numbers = []
-    for image in images:
-        number = LAST_NUMBER.search(PurePosixPath(image.name).stem)
-        if number is None:
-            raise DatasetInvalid(file, f"images[{image.name}].name", "has no number, from which its time is taken")
-        numbers.append(float(number[1]))
-    first, last = min(numbers), max(numbers)
-    return [(number - first) / ((last - first) or 1.0) for number in numbers]
 
 
 def _points(file: Path, rows: list[tuple[float, ...]]) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -1,5 +1,6 @@
 """The common form of all datasets: splits of frames, each with a camera and a time."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -134,12 +135,16 @@ class SceneData:
         if first >= 0 and last <= 1:
             return self
         length = (last - first) or 1.0
+        return self.retimed(lambda frame: (frame.t - first) / length)
 
-        def scaled(frames: list[Frame]) -> list[Frame]:
-            return [replace(frame, t=(frame.t - first) / length) for frame in frames]
+    def retimed(self, time: Callable[[Frame], float]) -> "SceneData":
+        """The same scene, with another time of each frame."""
 
-        splits = {split: scaled(frames) for split, frames in self.splits.items()}
-        return replace(self, splits=splits, unsplit=None if self.unsplit is None else scaled(self.unsplit))
+        def changed(frames: list[Frame]) -> list[Frame]:
+            return [replace(frame, t=time(frame)) for frame in frames]
+
+        splits = {split: changed(frames) for split, frames in self.splits.items()}
+        return replace(self, splits=splits, unsplit=None if self.unsplit is None else changed(self.unsplit))
 
     def split_again(self, every: int) -> "SceneData":
         """Split the training frames, or all frames of a dataset that names no splits, as `DataConfig.llffhold` says.

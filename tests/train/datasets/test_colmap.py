@@ -23,7 +23,7 @@ def test_points_colors_and_size_of_the_scene(tmp_path: Path, ending: str, place:
 
 
 @both
-def test_times_are_the_last_numbers_of_the_names_and_every_8th_image_is_for_testing(tmp_path: Path, ending: str):
+def test_times_are_numbers_of_the_names_and_every_8th_image_is_for_testing(tmp_path: Path, ending: str):
     names = [f"v_{index:02}.png" for index in (8, 2, 3, 0, 1, 4, 5, 6, 7)]
     scene = load_scene(write_colmap(tmp_path, names=tuple(names), ending=ending))
     assert {split: [frame.name for frame in frames] for split, frames in scene.splits.items()} == SPLIT_OF_9
@@ -36,19 +36,6 @@ def test_every_nth_of_all_images_is_held_out(tmp_path: Path):
     splits = load_scene(write_colmap(tmp_path, names=names, ending="txt"), llffhold=4).splits
     held_out = {split: [int(frame.name[2:]) for frame in frames] for split, frames in splits.items()}
     assert held_out == {"test": [0, 4, 8], "val": [2, 6], "train": [1, 3, 5, 7]}
-
-
-def test_times_are_linear_in_the_numbers_found(tmp_path: Path):
-    names = ["cam2/take 3 frame 100.png", "cam1/take 3 frame 110.png", "cam1/take 3 frame 140.jpg.png"]
-    scene = load_scene(write_colmap(tmp_path, names=tuple(names), ending="txt"))
-    times = {frame.name: frame.t for frames in scene.splits.values() for frame in frames}
-    assert times == {"cam1_take 3 frame 110": 0.25, "cam1_take 3 frame 140.jpg": 1.0, "cam2_take 3 frame 100": 0.0}
-
-
-def test_names_without_a_time_are_named(tmp_path: Path):
-    folder = write_colmap(tmp_path, names=("a_1.png", "cam07/front.png"), ending="txt")
-    with pytest.raises(DatasetInvalid, match=r"images\[cam07/front\.png\]\.name` has no number"):
-        load_scene(folder)
 
 
 def test_without_points_the_cameras_determine_the_scene_size(tmp_path: Path):

@@ -105,6 +105,7 @@ def test_each_preset_trains(name: str, data: Path) -> None:
         ("init_min_views", 1.1), ("ema_fraction", -0.1),
         ("max_gaussians", 10), ("background", "green"), ("minutes", 0.0), ("refine_every_fraction", -0.1),
         ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),
+        ("time_from", "name"),
         *(("eps2d_init", eps2d) for eps2d in (-0.1, float("nan"), float("inf"))),
         *(("window_start_width", start) for start in (0.5, -0.1, float("nan"), "0.1", True)),
     ],

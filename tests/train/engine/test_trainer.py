@@ -22,6 +22,7 @@ from msdgs_train.engine.gradients import average_gradients
 from msdgs_train.engine.metrics_log import MetricsLog, read_metrics
 from msdgs_train.engine.run import fit
 from msdgs_train.engine.trainer import Trainer
+from msdgs_train.evaluation.evaluate import evaluate_run
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.gaussians.safe_load import CheckpointInvalid
@@ -172,6 +173,16 @@ def test_a_run_is_saved_before_its_last_evaluation(data: Path, tmp_path: Path, m
         fit(small_config(steps=2, llffhold=3, checkpoint_every=0, eval_every=0), data, tmp_path / "run")
     saved = load_model(tmp_path / "run" / "model.pt")
     assert (saved.step, saved.scene.llffhold) == (2, 3)
+
+
+@pytest.mark.usefixtures("no_curve")
+def test_a_run_is_evaluated_at_the_times_that_it_was_trained_with(data: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    fit(small_config(steps=2, time_from="none"), data, run)
+    assert load_model(run / "model.pt").scene.time_from == "none"
+    assert {frame.t for frame in evaluate_run(run, brief=True).frames} == {0.0}
+    with pytest.raises(InvalidInput, match=r"`config\.time_from` must be none, as when the run was started, got names"):
+        fit(small_config(steps=3, time_from="names"), data, run, resume=True)
 
 
 def test_images_of_a_step_share_it_evenly(data: Path) -> None:

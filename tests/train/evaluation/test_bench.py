@@ -2,6 +2,7 @@
 
 import csv
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,9 @@ def test_runs_are_of_each_scene_at_its_size(data: Path) -> None:
     ]  # fmt: skip
     assert [run.config.data.llffhold for run in runs[:4]] == [0, 0, 4, 4]
     assert len({run.folder for run in runs}) == 8
+    other_times = replace(scenes[0], time_from="index")
+    (timed,) = make_bench_runs({"a": preset("static")}, [other_times], (0,), data / "out")
+    assert (timed.config.data.time_from, timed.folder) == ("index", runs[0].folder)  # as of other settings of scenes
     slower = make_bench_runs({"a": preset("static").updated(threads=7)}, scenes, (0,), data / "out")
     assert not {run.folder for run in slower} & {run.folder for run in runs}
 

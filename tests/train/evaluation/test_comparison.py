@@ -66,6 +66,8 @@ def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) 
     assert systems["static"].model.layers == ()
     layers = (MLPConfig(width=16), MLPConfig(width=16, lr_init=1e-3))
     assert systems["k2 w=1"].model == dataclasses.replace(preset("msdgs-small").model, layers=layers, weights=False)
+    timed = read_systems(["static"], dataclasses.replace(BUDGET, time_from="index"))
+    assert timed["static"].data.time_from == "index"
     for config in systems.values():
         counts = (config.density.init_num_pts, config.density.max_gaussians)
         assert (config.run.steps, *counts, config.run.threads) == (6, 60, 90, 1)

@@ -152,6 +152,14 @@ def test_damaged_cameras_are_named(model_file: Path, name: str, cameras: Any):
         load_model(model_file)
 
 
+@pytest.mark.parametrize("time_from", ["name", "(", 3])
+def test_a_source_of_times_that_cannot_be_used_is_named(model_file: Path, time_from: object):
+    scene = torch.load(model_file, weights_only=True)["scene"]
+    rewritten(model_file, scene=scene | {"time_from": time_from})
+    with pytest.raises(CheckpointInvalid, match=r"scene\.time_from must be names, index, none or a regular expression"):
+        load_model(model_file)
+
+
 @pytest.mark.parametrize("name", ["gaussians.raw_quats", "gaussians.embeddings", "deformation.layers.0.first.weight"])
 @pytest.mark.parametrize("tensor", [None, torch.zeros(2, 2)])
 def test_tensors_missing_or_of_another_shape_are_named(model_file: Path, name: str, tensor: torch.Tensor | None):
