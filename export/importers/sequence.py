@@ -55,6 +55,7 @@ class Frames:
     dropped: int
     antialiasing: str
     blended: bool
+    warnings: tuple[str, ...] = ()  # of all files, each once
 
     def times(self) -> list[float]:
         """The times of the frames."""
@@ -103,7 +104,8 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     problem = None if how == "switch" else _why_not_blended(frames, any(each.dropped for each in read))
     if how == "blend" and problem:
         raise ImportFailed(folder, f"can't be blended: {problem}")
-    return Frames(frames, dropped, read[0].antialiasing, problem is None and how != "switch")
+    warnings = tuple(dict.fromkeys(warning for each in read for warning in each.warnings))
+    return Frames(frames, dropped, read[0].antialiasing, problem is None and how != "switch", warnings)
 
 
 def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:

@@ -197,7 +197,7 @@ def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
     quats = texture(meta.files("quats", 1)[0], count)
     scales = meta.numbers("scales.codebook", 256)[scales]
     antialiasing, warnings = _model(meta)
-    warnings += [f"{META} has `{name}`, which isn't known and left out" for name in FIELDS.unlisted(meta.names())]
+    warnings += [f"{META} has `{name}`, which isn't known and is left out" for name in FIELDS.unlisted(meta.names())]
     made = splats(path, means, scales, _quats(quats), colors[:, 3] / 255, sh, antialiasing)
     return replace(made, warnings=tuple(warnings))
 

@@ -9,7 +9,7 @@ import numpy as np
 from export.importers.errors import ImportFailed, cut_off
 from export.importers.splats.axes import from_right_up_back
 from export.importers.splats.base import Splats, smallest_three, splats
-from export.importers.splats.coordinate_systems import SYSTEMS, from_system
+from export.importers.splats.coordinate_systems import MISNAMED, SYSTEMS, from_system
 from export.importers.splats.spz_container import (
     EXTENSIONS,
     FIELDS,
@@ -40,11 +40,11 @@ def read_spz(file: Path, *, converted: bool = True) -> Splats:
     found = read_container(file)
     system, leaves = DEFAULT_SYSTEM, None
     if found.header.flags & EXTENSIONS:
-        system = _system(file, _extensions(file, found.more), found.warnings)
+        system = _system(file, _extensions(file, found.trailing), found.warnings)
     elif found.header.flags & LEVELS:
-        leaves = _leaves(file, found.header.count, found.more)
-    elif found.more:
-        found.warnings.append(f"its version doesn't define {len(found.more):,} of its bytes, which are left out")
+        leaves = _leaves(file, found.header.count, found.trailing)
+    elif found.trailing:
+        found.warnings.append(f"its version doesn't define {len(found.trailing):,} of its bytes, which are left out")
     if not converted and system != DEFAULT_SYSTEM:
         found.warnings.append(f"it states the coordinate system {system}, which spz:unturned leaves as it is")
     return replace(_decoded(file, found, leaves, system if converted else None), warnings=tuple(found.warnings))
@@ -81,7 +81,11 @@ def _system(file: Path, extensions: dict[int, bytes], warnings: list[str]) -> st
         raise ImportFailed(file, f"{names[COORDINATE_SYSTEM]} states coordinate system {number}; 1 to 16 are defined")
     if not number:
         warnings.append("its coordinate system is unspecified; it is read as right, up, back, SPZ's usual one")
-    return SYSTEMS[number - 1] if number else DEFAULT_SYSTEM
+    system = SYSTEMS[number - 1] if number else DEFAULT_SYSTEM
+    if system in MISNAMED:
+        meant = MISNAMED[system]
+        warnings.append(f"its coordinate system {system} is read as {meant}, which Niantic's library writes so")
+    return system
 
 
 def _leaves(file: Path, count: int, tree: bytes) -> np.ndarray:

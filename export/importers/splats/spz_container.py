@@ -53,7 +53,7 @@ MIP, EXTENSIONS, LEVELS = 0x01, 0x02, 0x80
 TREE_BYTES = 6
 """Bytes of the tree for each Gaussian: the number of children and the first of them."""
 
-MAX_MORE = 1 << 20
+MAX_EXTENSIONS = 1 << 20
 """Most bytes of extensions behind the attributes of versions 2 and 3."""
 
 DEFLATE_LIMIT = 1_032
@@ -77,9 +77,9 @@ class Header(NamedTuple):
         return [self.count * each for each in (9, 1, 3, 3, rotation, rest)]
 
     @property
-    def most_more(self) -> int:
+    def max_trailing(self) -> int:
         """The most bytes that may follow the attributes of versions 2 and 3."""
-        return TREE_BYTES * self.count if self.flags & LEVELS else MAX_MORE
+        return TREE_BYTES * self.count if self.flags & LEVELS else MAX_EXTENSIONS
 
 
 class Container(NamedTuple):
@@ -87,7 +87,7 @@ class Container(NamedTuple):
 
     header: Header
     parts: list[bytes]  # of the sizes of the header
-    more: bytes  # extensions or the tree of levels of detail
+    trailing: bytes  # extensions or the tree of levels of detail
     warnings: list[str]
 
 
@@ -105,8 +105,8 @@ def read_container(file: Path) -> Container:
     size = sum(header.sizes)
     if len(body) < size:
         raise cut_off(file, f"{header.count:,} Gaussians", size, len(body))
-    if len(body) - size > header.most_more:
-        raise ImportFailed(file, f"has more than {header.most_more:,} bytes behind its {header.count:,} Gaussians")
+    if len(body) - size > header.max_trailing:
+        raise ImportFailed(file, f"has more than {header.max_trailing:,} bytes behind its {header.count:,} Gaussians")
     ends = list(itertools.accumulate(header.sizes))
     parts = [body[end - part : end] for end, part in zip(ends, header.sizes, strict=True)]
     return Container(header, parts, body[size:], _reserved(header.streams != 0))
@@ -155,7 +155,7 @@ def _unzipped(file: Path, contents: bytes) -> tuple[Header, bytes]:
         needed, possible = sum(header.sizes), DEFLATE_LIMIT * len(contents)
         if needed > possible:
             raise cut_off(file, f"{header.count:,} Gaussians", needed, possible)
-        body = unpacker.decompress(unpacker.unconsumed_tail, needed + header.most_more + 1)
+        body = unpacker.decompress(unpacker.unconsumed_tail, needed + header.max_trailing + 1)
     except zlib.error:
         raise ImportFailed(file, "has a damaged gzip stream") from None
     if len(body) >= needed and not unpacker.eof and not unpacker.unconsumed_tail:
