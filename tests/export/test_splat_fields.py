@@ -352,6 +352,17 @@ def test_bytes_of_a_ksplat_that_its_version_does_not_define_are_warned_about(tmp
     )
 
 
+def test_sections_of_a_ksplat_may_be_empty_or_of_other_degrees(tmp_path: Path):
+    g = some_gaussians(2, sh_degree=1)
+    contents = ksplat_bytes(g, level=0, sections=3)  # of 1, 1 and no Gaussians
+    (tmp_path / "a.ksplat").write_bytes(contents)
+    assert len(read_ksplat(tmp_path / "a.ksplat")) == 2
+    second, row = HEAD + 1024, 44 + 9 * 4
+    (tmp_path / "a.ksplat").write_bytes(patched(contents, second + 40, "<H", 0)[: HEAD + 3 * 1024 + row + 44])
+    read = read_ksplat(tmp_path / "a.ksplat").gaussians
+    np.testing.assert_array_equal(read.sh[:, 1:], [g.sh[0, 1:], np.zeros((3, 3))])
+
+
 @pytest.mark.parametrize(
     ("field", "value", "warning"),
     [

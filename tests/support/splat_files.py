@@ -139,7 +139,7 @@ def _ksplat_section(g: Gaussians, level: int, least: float, most: float) -> tupl
     partly filled ones."""
     number, harmonic = ("<f4", "<f4") if level == 0 else ("<f2", "<f2" if level == 1 else "u1")
     degree = {1: 0, 4: 1, 9: 2}[g.sh.shape[1]]
-    bands = [g.sh[:, k * k : (k + 1) ** 2].transpose(0, 2, 1).reshape(len(g), -1) for k in range(1, degree + 1)]
+    bands = [g.sh[:, k * k : (k + 1) ** 2].transpose(0, 2, 1).reshape(len(g), 6 * k + 3) for k in range(1, degree + 1)]
     rest = np.concatenate([np.empty((len(g), 0)), *bands], axis=1)
     if level == 2:
         rest = np.round((rest - least) / (most - least) * 255)

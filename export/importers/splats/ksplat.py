@@ -72,6 +72,7 @@ class Header(NamedTuple):
 class Section(NamedTuple):
     """The header of a section; there is room for `max_count` Gaussians, of which the first `count` are there."""
 
+    number: int
     count: int
     max_count: int
     bucket_size: int
@@ -113,8 +114,8 @@ def read_ksplat(file: Path) -> Splats:
     for number in range(header.max_sections):
         at = HEADER_BYTES + SECTION_BYTES * number
         is_defined &= not any(contents[at + SECTION.size : at + SECTION_BYTES])
-        section = Section(*SECTION.unpack_from(contents, at))
-        end = _end(file, header.level, section, contents, data, number)
+        section = Section(number, *SECTION.unpack_from(contents, at))
+        end = _end(file, header.level, section, contents, data)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             parts.append(_decoded(file, header, section, contents, data))
         data = end
@@ -140,18 +141,19 @@ def _record(level: int, sh_degree: int) -> np.dtype:
     )
 
 
-def _end(file: Path, level: int, section: Section, contents: bytes, start: int, number: int) -> int:
+def _end(file: Path, level: int, section: Section, contents: bytes, start: int) -> int:
     """Where a section ends that begins at `start`. Raises `ImportFailed` if its header can't be right."""
+    name = f"section {section.number}"
     if section.sh_degree > MAX_SH_DEGREE:
-        raise ImportFailed(file, f"section {number} has SH of degree {section.sh_degree}; 0, 1 and 2 are defined")
+        raise ImportFailed(file, f"{name} has SH of degree {section.sh_degree}; 0, 1 and 2 are defined")
     if section.buckets and section.bucket_bytes != BUCKET_BYTES:
-        raise ImportFailed(file, f"section {number} has buckets of {section.bucket_bytes} bytes instead of 12")
+        raise ImportFailed(file, f"{name} has buckets of {section.bucket_bytes} bytes instead of 12")
     if section.count > section.max_count:
-        raise ImportFailed(file, f"section {number} has {section.count:,} Gaussians, room for {section.max_count:,}")
+        raise ImportFailed(file, f"{name} has {section.count:,} Gaussians, room for {section.max_count:,}")
     size = 4 * section.partial_buckets + BUCKET_BYTES * section.buckets
     size += _record(level, section.sh_degree).itemsize * section.max_count
     if start + size > len(contents):
-        raise cut_off(file, f"section {number}", size, len(contents) - start)
+        raise cut_off(file, name, size, len(contents) - start)
     return start + size
 
 
@@ -168,11 +170,13 @@ def _decoded(file: Path, header: Header, section: Section, contents: bytes, star
         low, high = header.min_sh or -SH_LIMIT, header.max_sh or SH_LIMIT
         rest = low + rest / 255 * (high - low)
     # within a degree, the coefficients of red come first, then those of green and of blue
-    bands = [rest[:, 3 * (k * k - 1) : 3 * ((k + 1) ** 2 - 1)] for k in range(1, section.sh_degree + 1)]
-    sh = [band.reshape(len(rows), 3, -1).transpose(0, 2, 1) for band in bands]
+    bands = [
+        rest[:, 3 * (k * k - 1) : 3 * ((k + 1) ** 2 - 1)].reshape(-1, 3, 2 * k + 1).transpose(0, 2, 1)
+        for k in range(1, section.sh_degree + 1)
+    ]
     dc = (rgba[:, None, :3] - 0.5) / SH_C0
     log_scales = np.log(rows["scales"].astype(np.float64))
-    return Arrays(means, log_scales, rows["quats"], rgba[:, 3], np.concatenate([dc, *sh], axis=1))
+    return Arrays(means, log_scales, rows["quats"], rgba[:, 3], np.concatenate([dc, *bands], axis=1))
 
 
 def _centers(file: Path, section: Section, contents: bytes, start: int) -> np.ndarray:
@@ -182,7 +186,7 @@ def _centers(file: Path, section: Section, contents: bytes, start: int) -> np.nd
     held = section.full_buckets * section.bucket_size + int(lengths.sum())
     if filled > section.buckets or held < section.count:
         problem = f"has {section.count:,} Gaussians and {section.buckets:,} buckets"
-        raise ImportFailed(file, f"a section {problem}, of which {filled:,} are filled with {held:,}")
+        raise ImportFailed(file, f"section {section.number} {problem}, of which {filled:,} are filled with {held:,}")
     centers = np.frombuffer(contents, "<f4", 3 * section.buckets, start + lengths.size * 4).reshape(-1, 3)
     ends = np.cumsum(np.concatenate([np.full(section.full_buckets, section.bucket_size), lengths]))
     return centers[np.searchsorted(ends, np.arange(section.count), side="right")]
