@@ -64,7 +64,8 @@ def _splats(path: Path, file_format: str, output: Path, console: Console, min_ps
         path = path.parent  # its limits and its digest are those of all files
     with console.status(f"reading {path}"):
         source = read_splats(path, file_format)
-        _warn(source.warnings, console)
+        for warning in source.warnings:
+            console.print(f"warning: {warning}", markup=False)
         contents = static_scene(source, digest(path))
         return write_imported(output, contents, lambda t: source.gaussians, [0.0], min_psnr=min_psnr)
 
@@ -73,7 +74,6 @@ def _sequence(path: Path, file_format: str, output: Path, console: Console, min_
     how = file_format.partition(":")[2] or None
     with tracked(console) as track:
         sequence = read_sequence(path, how, track("reading frames", len(frame_files(path))))
-        _warn(sequence.warnings, console)
         times = sequence.times()
         scene = write_imported(
             output,
@@ -87,11 +87,6 @@ def _sequence(path: Path, file_format: str, output: Path, console: Console, min_
     way = "blended" if sequence.blended else "switched, since they don't correspond or blending is off"
     console.print(f"{len(times)} frames, {way}")
     return scene
-
-
-def _warn(warnings: tuple[str, ...], console: Console) -> None:
-    for warning in warnings:
-        console.print(f"warning: {warning}", markup=False)
 
 
 def _print(scene: BakedScene, output: Path, console: Console) -> None:

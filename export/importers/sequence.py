@@ -55,7 +55,6 @@ class Frames:
     dropped: int
     antialiasing: str
     blended: bool
-    warnings: tuple[str, ...] = ()  # of all files, each once
 
     def times(self) -> list[float]:
         """The times of the frames."""
@@ -104,8 +103,7 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     problem = None if how == "switch" else _why_not_blended(frames, any(each.dropped for each in read))
     if how == "blend" and problem:
         raise ImportFailed(folder, f"can't be blended: {problem}")
-    warnings = tuple(dict.fromkeys(warning for each in read for warning in each.warnings))
-    return Frames(frames, dropped, read[0].antialiasing, problem is None and how != "switch", warnings)
+    return Frames(frames, dropped, read[0].antialiasing, problem is None and how != "switch")
 
 
 def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:

@@ -73,7 +73,10 @@ def read_sog(path: Path) -> Splats:
     """Read a SOG folder, its meta.json or a zip. Raises `ImportFailed`."""
     if path.is_dir() or path.name == META:
         folder = path if path.is_dir() else path.parent
-        return _decoded(path, lambda name, most: _from_folder(path, folder / name, most))
+        made = _decoded(path, lambda name, most: _from_folder(path, folder / name, most))
+        if not (folder.resolve().parent / LEVELS).is_file():
+            return made
+        return replace(made, warnings=(*made.warnings, f"it is a piece of the streamed SOG of the {LEVELS} above it"))
     try:
         with zipfile.ZipFile(path) as archive:
             return _decoded(path, lambda name, most: _from_zip(path, archive, name, most))
