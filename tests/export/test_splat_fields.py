@@ -107,7 +107,10 @@ TURNED = but(
 
 SPZ_CASES: dict[str, Sequence[tuple[bytes, Expected]]] = {
     "version": [(patched(SPZ, 4, "<I", v), rf"is SPZ version {v}; versions 2, 3 and 4 can be read") for v in (0, 1, 5)],
-    "numPoints": [(patched(SPZ, 8, "<I", 13), "cut off: 13 Gaussians")],
+    "numPoints": [
+        (patched(SPZ, 8, "<I", 13), "cut off: 13 Gaussians"),
+        (patched(SPZ4, 8, "<I", 0), "holds no Gaussians"),
+    ],
     "shDegree": [(patched(SPZ, 12, "B", 0), but(sh=lambda sh: sh[:, :1]))],
     "fractionalBits": [(patched(SPZ, 13, "B", SPZ[13] - 1), but(means=lambda means: 2 * means))],
     "flag 0x01": [(patched(SPZ, 14, "B", 1), mip), (patched(SPZ4, 14, "B", 1), mip)],

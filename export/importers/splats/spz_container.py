@@ -125,6 +125,8 @@ def _header(file: Path, start: bytes) -> Header:
         raise ImportFailed(file, f"isn't an SPZ file: NGSP expected, found {magic!r}")
     if header.version not in (2, 3, 4):
         raise ImportFailed(file, f"is SPZ version {header.version}; versions 2, 3 and 4 can be read")
+    if not header.count:
+        raise ImportFailed(file, "holds no Gaussians")
     if header.sh_degree > 3:
         raise ImportFailed(file, f"has SH of degree {header.sh_degree}; up to 3 can be read")
     if header.fractional_bits > 24:
