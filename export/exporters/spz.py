@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from export.importers.splats.axes import from_right_up_back
-from export.importers.splats.spz import COLOR_SCALE, HEADER, MAGIC, MIP
+from export.importers.splats.spz import COLOR_SCALE
+from export.importers.splats.spz_container import HEADER, MAGIC, MIP
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 

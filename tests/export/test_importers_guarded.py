@@ -81,10 +81,14 @@ def test_arrays_come_back_by_name(tmp_path: Path):
 def test_no_splat_file_is_unpacked_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file_format: str):
     kind = "spz 4" if file_format.startswith("spz") else file_format
     file = write_splats(tmp_path, kind, some_gaussians(20, 0))
+    if kind == "spz 4":
+        contents = file.read_bytes()
+        file.write_bytes(contents[:31] + b"\1" + contents[32:])  # reserved
     here = READERS[file_format](file)
+    assert bool(here.warnings) == (kind == "spz 4")
     monkeypatch.setitem(READERS, file_format, lambda _: pytest.fail("in this process"))
     read = read_splats(file, file_format)
-    assert (read.dropped, read.antialiasing) == (here.dropped, here.antialiasing)
+    assert (read.dropped, read.antialiasing, read.warnings) == (here.dropped, here.antialiasing, here.warnings)
     for name, array in here.to_arrays().items():
         assert np.array_equal(read.to_arrays()[name], array), name
 

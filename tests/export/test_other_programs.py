@@ -1,7 +1,9 @@
-"""Written files in programs of other authors: OpenUSD's validators, Khronos' glTF validator, Niantic's SPZ library,
-PlayCanvas' splat-transform."""
+"""Files in programs of other authors: OpenUSD's validators, Khronos' glTF validator, Niantic's SPZ library, PlayCanvas'
+splat-transform, mkkellogg's viewer."""
 
+import gzip
 import json
+import struct
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.special import expit
 
 from export.exporters.gltf import EXTENSION, read_gltf, write_gltf
@@ -17,11 +20,12 @@ from export.exporters.ply import write_ply
 from export.exporters.spz import write_spz
 from export.exporters.usd import write_usd
 from export.importers.splats.base import as_float32
+from export.importers.splats.ksplat import read_ksplat
 from export.importers.splats.ply import read_ply
-from export.importers.splats.spz import read_spz
+from export.importers.splats.spz import COORDINATE_SYSTEM, read_spz
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_serve.scene.quaternion import to_matrix
-from tests.support.splat_files import some_gaussians
+from msdgs_serve.scene.spherical_harmonics import SH_C0
+from tests.support.splat_files import angles, assert_same, some_gaussians, spz3_bytes, spz4_bytes
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -40,25 +44,13 @@ def node(*arguments: Any) -> str:
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
 
 
-def read_elsewhere(file: Path) -> Any:
-    return json.loads(node(NODE / "read.mjs", file).splitlines()[-1])
+def read_elsewhere(*files: Path) -> list[Any]:
+    return json.loads(node(NODE / "read.mjs", *files).splitlines()[-1])
 
 
 def splat_transform(file: Path, *arguments: str, out: Path) -> Path:
     node(SPLAT_TRANSFORM, "--quiet", file, *arguments, out)
     return out
-
-
-def assert_same(got: Gaussians, expected: Gaussians) -> None:
-    for name in ("means", "scales", "opacities", "sh"):
-        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), atol=tolerance("splat_values"))
-    assert angles(got, expected) < tolerance("splat_values")
-
-
-def angles(got: Gaussians, expected: Gaussians) -> float:
-    """The largest difference of axes, which may point either way."""
-    cosines = to_matrix(got.quats).transpose(0, 2, 1) @ to_matrix(expected.quats)
-    return np.abs(np.abs(cosines) - np.eye(3)).max()
 
 
 def assert_near(got: Gaussians, expected: Gaussians) -> None:
@@ -112,7 +104,7 @@ def gltf_faults(file: Path) -> list[dict[str, Any]]:
     unknown = [("UNSUPPORTED_EXTENSION", "/extensionsUsed/0"), ("MESH_PRIMITIVE_INVALID_ATTRIBUTE", names)]
     return [
         message
-        for message in read_elsewhere(file)
+        for message in read_elsewhere(file)[0]
         if not any(message["code"] == code and message["pointer"].startswith(start) for code, start in unknown)
     ]
 
@@ -132,23 +124,70 @@ def test_khronos_validator_finds_a_wrong_accessor(tmp_path: Path):
     assert "ACCESSOR_TOO_LONG" in {fault["code"] for fault in gltf_faults(tmp_path / "a.glb")}
 
 
+def read_by_niantic(*files: Path) -> list[tuple[Gaussians, str]]:
+    """The Gaussians in right, down, front, and the anti-aliasing."""
+    found = []
+    for theirs in read_elsewhere(*files):
+        antialiasing = "mip" if theirs.pop("antialiased") else "dilate"
+        count = len(theirs["alphas"])
+        arrays = {name: np.reshape(values, (count, -1)).astype(np.float32) for name, values in theirs.items()}
+        gaussians = Gaussians(
+            arrays["positions"],
+            arrays["rotations"][:, [3, 0, 1, 2]],
+            np.exp(arrays["scales"]),
+            expit(arrays["alphas"][:, 0]),
+            np.concatenate([arrays["colors"], arrays["sh"]], axis=1).reshape(count, -1, 3),
+        )
+        found.append((gaussians, antialiasing))
+    return found
+
+
 @needs_node
 @pytest.mark.parametrize(("degree", "antialiasing"), [(0, "dilate"), (1, "mip"), (3, "dilate")])
 def test_niantics_library_reads_an_spz(tmp_path: Path, degree: int, antialiasing: str):
     g, file = some_gaussians(sh_degree=degree), tmp_path / "a.spz"
     write_spz(file, g, antialiasing)
-    theirs = read_elsewhere(file)
-    assert theirs.pop("antialiased") == (antialiasing == "mip")
-    arrays = {name: np.reshape(values, (len(g), -1)).astype(np.float32) for name, values in theirs.items()}
-    got = Gaussians(
-        arrays["positions"],
-        arrays["rotations"][:, [3, 0, 1, 2]],
-        np.exp(arrays["scales"]),
-        expit(arrays["alphas"][:, 0]),
-        np.concatenate([arrays["colors"], arrays["sh"]], axis=1).reshape(len(g), -1, 3),
-    )
+    ((got, got_antialiasing),) = read_by_niantic(file)
+    assert got_antialiasing == antialiasing
     assert_same(got, read_spz(file).gaussians)
     assert_near(got, g)
+
+
+@needs_node
+@pytest.mark.parametrize("degree", [1, 3])
+def test_niantics_library_converts_each_coordinate_system_in_the_same_way(tmp_path: Path, degree: int):
+    version3 = gzip.decompress(spz3_bytes(some_gaussians(50, degree)))
+    files = [tmp_path / f"{number}.spz" for number in range(1, 17)]
+    for number, file in enumerate(files, start=1):
+        file.write_bytes(spz4_bytes(version3, {COORDINATE_SYSTEM: struct.pack("<I", number)}))
+    for file, (theirs, _) in zip(files, read_by_niantic(*files), strict=True):
+        assert_same(read_spz(file).gaussians, theirs)
+
+
+@needs_node
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize(("section", "block", "bucket"), [(0, 5.0, 256), (100, 0.7, 5)])
+def test_a_ksplat_is_read_as_its_viewer_writes_it(
+    tmp_path: Path, level: int, degree: int, section: int, block: float, bucket: int
+):
+    """One section of one bucket, or three sections of 100 Gaussians in full buckets of 5 and partly filled ones."""
+    g = some_gaussians(sh_degree=degree)
+    write_ply(tmp_path / "a.ply", g)
+    node(NODE / "write_ksplat.mjs", tmp_path / "a.ply", tmp_path / "a.ksplat", level, degree, section, block, bucket)
+    got = read_ksplat(tmp_path / "a.ksplat").gaussians
+    assert len(got) == len(g)
+    nearest = np.asarray(KDTree(got.means).query(g.means)[1])
+    got = Gaussians(*(array[nearest] for array in vars(got).values()))
+    half, step = tolerance("half_float"), block / 2 / 32767 / 2
+    np.testing.assert_allclose(got.means, g.means, atol=step + tolerance("splat_values") if level else 0)
+    np.testing.assert_allclose(got.scales, g.scales, rtol=half)
+    np.testing.assert_allclose(got.opacities, g.opacities, atol=1 / 255)
+    np.testing.assert_allclose(got.sh[:, 0], g.sh[:, 0], atol=1 / 255 / SH_C0)
+    assert angles(got, g) < 4 * half
+    rest = got.sh[:, 1:] - g.sh[:, 1:]
+    bound = (0, half, np.ptp(g.sh[:, 1:]) / 255 if degree else 0)[level]
+    assert np.abs(rest).max(initial=0) <= bound * (1 + half)
 
 
 @needs_node

@@ -17,6 +17,8 @@ from export.exporters.spz import write_spz
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
+from tests.support.tolerances import tolerance
 
 COUNT = 300
 """Gaussians of a file: more than one chunk of a compressed PLY."""
@@ -118,16 +120,52 @@ def splat_bytes(g: Gaussians) -> bytes:
     return rows.tobytes()
 
 
-def ksplat_bytes(g: Gaussians) -> bytes:
-    """`.ksplat` 0.1 of one section, degree 0, compression level 0: nothing but colors is rounded."""
-    rows = np.empty(len(g), [("numbers", "<f4", 10), ("color", "u1", 4)])
-    rows["numbers"], rows["color"] = np.column_stack([g.means, g.scales, g.quats]), _rgba(g)
-    header, section = bytearray(4096), bytearray(1024)
-    header[:2] = (0, 1)
-    struct.pack_into("<4I", header, 4, 1, 1, len(g), len(g))
-    struct.pack_into("<2I", section, 0, len(g), len(g))
-    struct.pack_into("<I", section, 28, rows.nbytes)
-    return bytes(header + section) + rows.tobytes()
+def ksplat_bytes(g: Gaussians, level: int = 0, sections: int = 1) -> bytes:
+    """`.ksplat` 0.1 of SH up to degree 2. Level 0 rounds nothing but colors."""
+    least, most = g.sh[:, 1:].min(initial=-1), g.sh[:, 1:].max(initial=1)
+    parts = [
+        _ksplat_section(Gaussians(*(array[part] for array in vars(g).values())), level, least, most)
+        for part in np.array_split(np.arange(len(g)), sections)
+    ]
+    header = bytearray(4096)
+    header[1] = 1
+    struct.pack_into("<4IH", header, 4, sections, sections, len(g), len(g), level)
+    struct.pack_into("<2f", header, 36, least, most)
+    return b"".join([bytes(header), *(head for head, _ in parts), *(body for _, body in parts)])
+
+
+def _ksplat_section(g: Gaussians, level: int, least: float, most: float) -> tuple[bytes, bytes]:
+    """The header and the body of a section. From level 1 on its Gaussians, sorted by x, are in two full buckets and two
+    partly filled ones."""
+    number, harmonic = ("<f4", "<f4") if level == 0 else ("<f2", "<f2" if level == 1 else "u1")
+    degree = {1: 0, 4: 1, 9: 2}[g.sh.shape[1]]
+    bands = [g.sh[:, k * k : (k + 1) ** 2].transpose(0, 2, 1).reshape(len(g), 6 * k + 3) for k in range(1, degree + 1)]
+    rest = np.concatenate([np.empty((len(g), 0)), *bands], axis=1)
+    if level == 2:
+        rest = np.round((rest - least) / (most - least) * 255)
+    fields = [("place", "<f4" if level == 0 else "<u2", 3), ("size", number, 3), ("turn", number, 4)]
+    rows = np.empty(len(g), [*fields, ("color", "u1", 4), ("sh", harmonic, (rest.shape[1],))])
+    rows["place"], rows["size"], rows["turn"], rows["color"], rows["sh"] = g.means, g.scales, g.quats, _rgba(g), rest
+    header = bytearray(1024)
+    struct.pack_into("<2I", header, 0, len(g), len(g))
+    struct.pack_into("<H", header, 40, degree)
+    buckets = b""
+    if level:
+        rows = rows[order := np.argsort(g.means[:, 0])]
+        full, block, steps = len(g) // 3, 4.0, 30_000
+        lengths = [full, full, 1, len(g) - 2 * full - 1]
+        starts = np.cumsum([0, *lengths[:-1]])
+        centers = np.array(
+            [g.means[order[start : start + n]].mean(axis=0) for start, n in zip(starts, lengths, strict=True)]
+        )
+        around = g.means[order] - np.repeat(centers, lengths, axis=0)
+        rows["place"] = np.round(around / (block / 2) * steps) + steps
+        buckets = np.array(lengths[2:], "<u4").tobytes() + centers.astype("<f4").tobytes()
+        struct.pack_into("<2IfH", header, 8, full, len(lengths), block, 12)
+        struct.pack_into("<I", header, 24, steps)
+        struct.pack_into("<2I", header, 32, 2, 2)
+    struct.pack_into("<I", header, 28, len(buckets) + rows.nbytes)
+    return bytes(header), buckets + rows.tobytes()
 
 
 def spz3_bytes(g: Gaussians) -> bytes:
@@ -146,7 +184,12 @@ def spz2_bytes(version3: bytes, quats: np.ndarray) -> bytes:
     return header + version3[16 : 16 + 16 * count] + rotations + version3[16 + 20 * count :]
 
 
-def spz4_bytes(version3: bytes) -> bytes:
+def spz_extensions(extensions: dict[int, bytes]) -> bytes:
+    """The records of extensions, by number."""
+    return b"".join(struct.pack("<II", number, len(payload)) + payload for number, payload in extensions.items())
+
+
+def spz4_bytes(version3: bytes, extensions: dict[int, bytes] | None = None) -> bytes:
     """Version 4 of an unpacked version 3 stream: the same parts, each in a zstd stream."""
     _, _, count, degree, bits, flags, _ = struct.unpack_from("<4sIIBBBB", version3)
     sizes = [9 * count, count, 3 * count, 3 * count, 4 * count, 3 * ((degree + 1) ** 2 - 1) * count]
@@ -155,9 +198,27 @@ def spz4_bytes(version3: bytes) -> bytes:
         parts.append(version3[at : at + size])
         at += size
     packed = [zstandard.compress(part) for part in parts]
-    header = struct.pack("<4sIIBBBB", b"NGSP", 4, count, degree, bits, flags, len(parts)) + struct.pack("<I12x", 32)
+    records = spz_extensions(extensions or {})
+    flags |= 2 if extensions else 0
+    header = struct.pack("<4sIIBBBB", b"NGSP", 4, count, degree, bits, flags, len(parts))
+    header += struct.pack("<I12x", 32 + len(records)) + records
     table = b"".join(struct.pack("<QQ", len(small), len(part)) for small, part in zip(packed, parts, strict=True))
     return header + table + b"".join(packed)
+
+
+def spz_levels_bytes(g: Gaussians, flags: int = 0x80) -> bytes:
+    """Version 3, unpacked, with levels of detail as Spark writes them: a root of two nodes, the Gaussians below one of
+    them each, and halved opacities."""
+    half = len(g) // 2
+    nodes = np.array([0, 0, half, *range(len(g))])  # the inner nodes look like some of the leaves, and larger
+    larger = np.where(np.arange(len(nodes)) < 3, np.float32(4), np.float32(1))[:, None]
+    tree = Gaussians(g.means[nodes], g.quats[nodes], g.scales[nodes] * larger, g.opacities[nodes] / 2, g.sh[nodes])
+    packed = bytearray(gzip.decompress(spz3_bytes(tree)))
+    packed[14] |= flags
+    children = np.zeros(len(nodes), "<u2")
+    starts = np.zeros(len(nodes), "<u4")
+    children[:3], starts[:3] = (2, half, len(g) - half), (1, 3, 3 + half)
+    return bytes(packed) + children.tobytes() + starts.tobytes()
 
 
 def write_sog(folder: Path, g: Gaussians, palette: int | None = None) -> Path:
@@ -235,11 +296,14 @@ FORMATS: dict[str, tuple[str, Callable[[Gaussians], bytes]]] = {
     "compressed ply": ("a.compressed.ply", compressed_ply_bytes),
     "splat": ("a.splat", splat_bytes),
     "ksplat": ("a.ksplat", ksplat_bytes),
+    "ksplat, level 1": ("a.ksplat", lambda g: ksplat_bytes(g, 1)),
+    "ksplat, level 2": ("a.ksplat", lambda g: ksplat_bytes(g, 2, 3)),
     "sog": ("a.sog", sog_bytes),
     "spz 2": ("a.spz", lambda g: gzip.compress(spz2_bytes(gzip.decompress(spz3_bytes(g)), g.quats))),
     "spz 3": ("a.spz", spz3_bytes),
     "spz 3, bare": ("a.spz", lambda g: gzip.decompress(spz3_bytes(g))),
     "spz 4": ("a.spz", lambda g: spz4_bytes(gzip.decompress(spz3_bytes(g)))),
+    "spz, levels": ("a.spz", lambda g: gzip.compress(spz_levels_bytes(g))),
 }
 """File name and contents for Gaussians, by format."""
 
@@ -255,3 +319,15 @@ def drawn(g: Gaussians) -> np.ndarray:
     """[48, 64, 3] image of Gaussians from `some_gaussians`."""
     camera = Camera.from_fov(orbit(np.zeros(3), 3.0, 30, 20, np.array([0.0, -1.0, 0.0])), 64, 48, 50)
     return rasterize(g, camera).rgb
+
+
+def assert_same(got: Gaussians, expected: Gaussians) -> None:
+    for name in ("means", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), atol=tolerance("splat_values"))
+    assert angles(got, expected) < tolerance("splat_values")
+
+
+def angles(got: Gaussians, expected: Gaussians) -> float:
+    """The largest difference of axes, which may point either way."""
+    cosines = to_matrix(got.quats).transpose(0, 2, 1) @ to_matrix(expected.quats)
+    return np.abs(np.abs(cosines) - np.eye(3)).max()

@@ -108,6 +108,11 @@ TABLE = (
     Row("splat_file_db", 60.0, "stored as float32: lossless"),
     Row("quantised_splat_file_db", 45.0, "bytes of color and opacity, 8 to 16 bits of everything else: lossy"),
     Row("stored_frame", 1e-4, "16 bits over a motion of half the scene, relative to the scene"),
+    Row(
+        "half_float",
+        1e-3,
+        "values up to 2: half of the last of 11 bits, and toHalfFloat of three.js, which cuts it off",
+    ),
     Row("spz_position", 3e-4, "scene units; 12 fractional bits"),
     Row("spz_rotation", 2e-2, "entries of a matrix; 10 bits a component of one file, 10 of the other"),
     Row("damaged_file.seconds", 20.0, "of the processor; small files take milliseconds; some code is compiled, too"),

@@ -12,7 +12,7 @@ from export.importers.guard import read_guarded
 from export.importers.splats.base import Splats
 from export.importers.splats.ksplat import read_ksplat
 from export.importers.splats.ply import read_ply
-from export.importers.splats.sog import META, ZIP_PROBLEMS, read_sog
+from export.importers.splats.sog import LEVELS, META, ZIP_PROBLEMS, read_sog, refused_levels
 from export.importers.splats.splat import read_splat
 from export.importers.splats.spz import read_spz
 
@@ -26,12 +26,14 @@ READERS: dict[str, Callable[[Path], Splats]] = {
 }
 """Readers by name of the format."""
 
-UNPACKED = {"spz", "spz:unturned", "sog", "ksplat"}
+UNPACKED = {"spz", "spz:unturned", "sog"}
 """Formats that native code decompresses, in a subprocess; the others are read by NumPy."""
 
 
 def splat_format(path: Path) -> str | None:
     """The format of a file, or of a SOG folder; None if it is none of `READERS`. Raises `ImportFailed`."""
+    if path.name == LEVELS or (path / LEVELS).is_file():
+        raise refused_levels(path)
     if path.is_dir():
         return "sog" if (path / META).is_file() else None
     with path.open("rb") as file:
@@ -45,9 +47,12 @@ def splat_format(path: Path) -> str | None:
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
-                return "sog" if any(name.rsplit("/", 1)[-1] == META for name in archive.namelist()) else None
-    except ZIP_PROBLEMS as error:
-        raise ImportFailed(path, f"isn't a whole zip: {error}") from error
+                names = {name.rsplit("/", 1)[-1] for name in archive.namelist()}
+            if LEVELS in names:
+                raise refused_levels(path)
+            return "sog" if META in names else None
+    except ZIP_PROBLEMS:
+        raise ImportFailed(path, "isn't a whole zip") from None
     suffix = path.suffix.lower()
     return suffix[1:] if suffix in (".splat", ".ksplat", ".sog", ".spz") else None
 

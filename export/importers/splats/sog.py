@@ -4,6 +4,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,38 @@ import numpy as np
 from export.importers.errors import ImportFailed
 from export.importers.splats.base import Splats, smallest_three, splats
 from export.importers.splats.webp import read_texture
+from msdgs_train.datasets.common.fields import FieldTable
 
+FIELDS = FieldTable(
+    "SOG",
+    {
+        "version": "applied",
+        "count": "applied",
+        "antialias": "applied",
+        "model": "applied",
+        "asset": "harmless",
+        "extras": "harmless",
+        "means.mins": "applied",
+        "means.maxs": "applied",
+        "means.files": "applied",
+        "scales.codebook": "applied",
+        "scales.files": "applied",
+        "quats.files": "applied",
+        "sh0.codebook": "applied",
+        "sh0.files": "applied",
+        "shN.count": "applied",
+        "shN.bands": "applied",
+        "shN.codebook": "applied",
+        "shN.files": "applied",
+    },
+)
+"""Fields of meta.json. The format's own description lets later versions add fields without a new number."""
+
+PARTS = ("means", "scales", "quats", "sh0", "shN")
 META = "meta.json"
+LEVELS = "lod-meta.json"
+"""Marks a SOG of several levels of detail, each of many pieces, which is streamed while it is shown."""
+
 MAX_META_BYTES = 1 << 24
 MAX_GAUSSIANS = 1 << 26
 """Gaussians in one file: a texture has at most 16,383 pixels per side."""
@@ -42,12 +73,23 @@ def read_sog(path: Path) -> Splats:
     """Read a SOG folder, its meta.json or a zip. Raises `ImportFailed`."""
     if path.is_dir() or path.name == META:
         folder = path if path.is_dir() else path.parent
-        return _decoded(path, lambda name, most: _from_folder(path, folder / name, most))
+        made = _decoded(path, lambda name, most: _from_folder(path, folder / name, most))
+        if not (folder.resolve().parent / LEVELS).is_file():
+            return made
+        return replace(made, warnings=(*made.warnings, f"it is a piece of the streamed SOG of the {LEVELS} above it"))
     try:
         with zipfile.ZipFile(path) as archive:
             return _decoded(path, lambda name, most: _from_zip(path, archive, name, most))
-    except ZIP_PROBLEMS as error:
-        raise ImportFailed(path, f"isn't a whole zip: {error}") from error
+    except ZIP_PROBLEMS:
+        raise ImportFailed(path, "isn't a whole zip") from None
+
+
+def refused_levels(path: Path) -> ImportFailed:
+    """The error for a streamed SOG."""
+    convert = f"splat-transform -L 0 {LEVELS} scene.sog"
+    return ImportFailed(
+        path, f"is a streamed SOG ({LEVELS}); PlayCanvas' splat-transform makes one file of it: {convert}"
+    )
 
 
 def _from_folder(path: Path, file: Path, most: int) -> bytes:
@@ -82,8 +124,11 @@ class _Meta:
         self._path = path
         try:
             self._values = json.loads(contents)
-        except (ValueError, RecursionError) as error:
-            raise ImportFailed(path, f"its {META} isn't JSON: {error}") from error
+        except json.JSONDecodeError as error:
+            place = f"line {error.lineno}, column {error.colno}"
+            raise ImportFailed(path, f"its {META} isn't JSON from {place} on") from None
+        except (ValueError, RecursionError):
+            raise ImportFailed(path, f"its {META} isn't JSON") from None
         if not isinstance(self._values, dict):
             raise self.wrong("", "an object")
 
@@ -96,6 +141,12 @@ class _Meta:
         for part in name.split("."):
             value = value.get(part) if isinstance(value, dict) else None
         return value
+
+    def names(self) -> list[str]:
+        """The names of all fields, dotted within the parts that have textures."""
+        parts = {name: value for name, value in self._values.items() if name in PARTS and isinstance(value, dict)}
+        inner = [f"{name}.{field}" for name, part in parts.items() for field in part]
+        return [name for name in self._values if name not in parts] + inner
 
     def whole(self, name: str, most: int) -> int:
         value = self.get(name)
@@ -147,9 +198,22 @@ def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
     if meta.get("shN") is not None:
         sh = np.concatenate([sh, _harmonics(path, meta, count, texture)], axis=1)
     quats = texture(meta.files("quats", 1)[0], count)
-    is_mip = meta.get("model") == "antialiased" or meta.get("antialias") is True
     scales = meta.numbers("scales.codebook", 256)[scales]
-    return splats(path, means, scales, _quats(quats), colors[:, 3] / 255, sh, "mip" if is_mip else "dilate")
+    antialiasing, warnings = _model(meta)
+    warnings += [f"{META} has `{name}`, which isn't known and is left out" for name in FIELDS.unlisted(meta.names())]
+    made = splats(path, means, scales, _quats(quats), colors[:, 3] / 255, sh, antialiasing)
+    return replace(made, warnings=tuple(warnings))
+
+
+def _model(meta: _Meta) -> tuple[str, list[str]]:
+    """The anti-aliasing, and a warning for Gaussians that were trained to be drawn in another way."""
+    antialias, model = meta.get("antialias"), meta.get("model")
+    if antialias not in (None, True, False):
+        raise meta.wrong("antialias", "true or false")
+    if model not in (None, "default", "antialiased", "2dgs"):
+        return "dilate", [f"{META} has the unknown `model` {model!r}, which is drawn as `default`"]
+    flat = ["the Gaussians are 2D (`model` 2dgs) and are drawn as 3D ones that are nearly flat"]
+    return "mip" if antialias or model == "antialiased" else "dilate", flat if model == "2dgs" else []
 
 
 def _quats(stored: np.ndarray) -> np.ndarray:

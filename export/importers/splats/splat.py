@@ -7,6 +7,12 @@ import numpy as np
 from export.importers.errors import ImportFailed
 from export.importers.splats.base import Splats, splats
 from msdgs_serve.scene.spherical_harmonics import SH_C0
+from msdgs_train.datasets.common.fields import FieldTable
+
+FIELDS = FieldTable(
+    ".splat",
+    {"position": "applied", "scale": "applied", "color": "applied", "opacity": "applied", "rotation": "applied"},
+)
 
 RECORD = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
 
@@ -15,7 +21,9 @@ def read_splat(file: Path) -> Splats:
     """Read a `.splat` file, which has no header. Raises `ImportFailed` if its size isn't a multiple of a record."""
     size = file.stat().st_size
     if size % RECORD.itemsize or not size:
-        raise ImportFailed(file, f"is cut off: {size:,} bytes are no multiple of 32 per Gaussian")
+        raise ImportFailed(
+            file, f"is cut off or no .splat: {size:,} bytes aren't a multiple of 32, which each Gaussian has"
+        )
     records = np.fromfile(file, RECORD)
     rgba = records["rgba"] / 255
     quats = (records["quats"].astype(np.float64) - 128) / 128

@@ -1,166 +1,129 @@
-"""`.spz`, versions 2 and 3 (one gzip stream) and 4 (a zstd stream per attribute). Axes are right, up, back."""
+"""`.spz`, versions 2, 3 and 4. Axes are right, up, back, or those of an extension."""
 
-import itertools
 import struct
-import zlib
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import zstandard
 
 from export.importers.errors import ImportFailed, cut_off
 from export.importers.splats.axes import from_right_up_back
 from export.importers.splats.base import Splats, smallest_three, splats
-
-MAGIC = b"NGSP"
-GZIP = b"\x1f\x8b"
-HEADER = struct.Struct("<4sIIBBBB")
-MIP = 1
-"""Bit of the header's flags: trained with the anti-aliasing of Mip-Splatting."""
+from export.importers.splats.coordinate_systems import MISNAMED, SYSTEMS, from_system
+from export.importers.splats.spz_container import (
+    EXTENSIONS,
+    FIELDS,
+    LEVELS,
+    MIP,
+    TREE_BYTES,
+    Container,
+    Header,
+    read_container,
+)
 
 COLOR_SCALE = 0.15
 """SH coefficients c of degree 0 are stored as 0.15 c + 0.5 in a byte."""
 
-DEFLATE_LIMIT = 1_032
-"""Largest compression factor of Deflate."""
+COORDINATE_SYSTEM = 0xADBE0003
+"""Extension SPZ_ADOBE_coordinate_system: the number of the system in which the Gaussians are stored."""
 
-
-class Header(NamedTuple):
-    """The first 16 bytes, without the magic."""
-
-    version: int
-    count: int
-    sh_degree: int
-    fractional_bits: int
-    flags: int
-    streams: int  # of version 4
-
-    @property
-    def sizes(self) -> list[int]:
-        """Bytes of positions, opacities, colors, scales, rotations and SH above degree 0."""
-        rotation, rest = (3 if self.version == 2 else 4), 3 * ((self.sh_degree + 1) ** 2 - 1)
-        return [self.count * each for each in (9, 1, 3, 3, rotation, rest)]
+DEFAULT_SYSTEM = "RUB"
+"""Right, up, back."""
 
 
 def read_spz(file: Path, *, converted: bool = True) -> Splats:
     """Read an SPZ file, with its axes converted to those of a PLY if `converted`.
 
-    Raises `ImportFailed` for other versions, SH above degree 3 and cut-off files.
+    Of levels of detail, the finest is read. Raises `ImportFailed` for other versions, SH above degree 3, unknown flags
+    and damage.
     """
-    contents = file.read_bytes()
-    if contents.startswith(GZIP):
-        header, body = _unzipped(file, contents)
-    elif contents.startswith(MAGIC):
-        header, body = _header(file, contents[: HEADER.size]), contents[HEADER.size :]
-    else:
-        raise ImportFailed(file, "isn't an SPZ file: it begins neither as gzip nor with NGSP")
-    parts = _streams(file, header, contents) if header.version == 4 else _parts(file, header, body)
-    return _decoded(file, header, parts, converted)
+    found = read_container(file)
+    system, leaves = DEFAULT_SYSTEM, None
+    if found.header.flags & EXTENSIONS:
+        system = _system(file, _extensions(file, found.trailing), found.warnings)
+    elif found.header.flags & LEVELS:
+        leaves = _leaves(file, found.header.count, found.trailing)
+    elif found.trailing:
+        found.warnings.append(f"its version doesn't define {len(found.trailing):,} of its bytes, which are left out")
+    if not converted and system != DEFAULT_SYSTEM:
+        found.warnings.append(f"it states the coordinate system {system}, which spz:unturned leaves as it is")
+    return replace(_decoded(file, found, leaves, system if converted else None), warnings=tuple(found.warnings))
 
 
-def _header(file: Path, start: bytes) -> Header:
-    if len(start) < HEADER.size:
-        raise cut_off(file, "the header", HEADER.size, len(start))
-    magic, version, count, sh_degree, fractional_bits, flags, streams = HEADER.unpack(start)
-    if magic != MAGIC:
-        raise ImportFailed(file, f"isn't an SPZ file: NGSP expected, found {magic!r}")
-    if version not in (2, 3, 4):
-        raise ImportFailed(file, f"is SPZ version {version}; versions 2, 3 and 4 can be read")
-    if sh_degree > 3:
-        raise ImportFailed(file, f"has SH of degree {sh_degree}; up to 3 can be read")
-    if fractional_bits > 24:
-        raise ImportFailed(file, f"has positions with {fractional_bits} fractional bits out of 24")
-    return Header(version, count, sh_degree, fractional_bits, flags, streams)
+def _extensions(file: Path, records: bytes) -> dict[int, bytes]:
+    """The payload of each extension by its number."""
+    found: dict[int, bytes] = {}
+    at = 0
+    while at < len(records):
+        if len(records) - at < 8:
+            raise cut_off(file, "the header of an extension", 8, len(records) - at)
+        number, size = struct.unpack_from("<II", records, at)
+        payload = records[at + 8 : at + 8 + size]
+        if len(payload) < size:
+            raise cut_off(file, f"extension 0x{number:08X}", size, len(payload))
+        found.setdefault(number, payload)
+        at += 8 + size
+    return found
 
 
-def _unzipped(file: Path, contents: bytes) -> tuple[Header, bytes]:
-    """Decompress the header, and then as many bytes as it states."""
-    unpacker = zlib.decompressobj(wbits=31)
-    try:
-        header = _header(file, unpacker.decompress(contents, HEADER.size))
-        if header.version == 4:
-            raise ImportFailed(file, "is SPZ version 4 inside gzip, but version 4 has its own streams")
-        needed, possible = sum(header.sizes), DEFLATE_LIMIT * len(contents)
-        if needed > possible:
-            raise cut_off(file, f"{header.count:,} Gaussians", needed, possible)
-        body = unpacker.decompress(unpacker.unconsumed_tail, needed) if needed else b""
-        more = len(body) < needed or unpacker.decompress(unpacker.unconsumed_tail, 1)  # reads the checksum at the end
-    except zlib.error as error:
-        raise ImportFailed(file, f"has a damaged gzip stream: {error}") from error
-    if not more and not unpacker.eof:
-        raise ImportFailed(file, "is cut off: its gzip stream has no end")
-    return header, body
+def _system(file: Path, extensions: dict[int, bytes], warnings: list[str]) -> str:
+    """The coordinate system that an extension states; a warning is added for each extension that isn't known."""
+    names = {number: f"extension 0x{number:08X}" for number in extensions}
+    unknown = FIELDS.unlisted(names.values())
+    warnings += [f"its {name} isn't known and is left out: the scene may look different" for name in unknown]
+    if COORDINATE_SYSTEM not in extensions:
+        return DEFAULT_SYSTEM
+    payload = extensions[COORDINATE_SYSTEM]
+    if len(payload) < 4:
+        raise cut_off(file, names[COORDINATE_SYSTEM], 4, len(payload))
+    (number,) = struct.unpack_from("<I", payload)
+    if number > len(SYSTEMS):
+        raise ImportFailed(file, f"{names[COORDINATE_SYSTEM]} states coordinate system {number}; 1 to 16 are defined")
+    if not number:
+        warnings.append("its coordinate system is unspecified; it is read as right, up, back, SPZ's usual one")
+    system = SYSTEMS[number - 1] if number else DEFAULT_SYSTEM
+    if system in MISNAMED:
+        meant = MISNAMED[system]
+        warnings.append(f"its coordinate system {system} is read as {meant}, which Niantic's library writes so")
+    return system
 
 
-def _parts(file: Path, header: Header, body: bytes) -> list[bytes]:
-    """The parts of versions 2 and 3, one after the other."""
-    if len(body) < sum(header.sizes):
-        raise cut_off(file, f"{header.count:,} Gaussians", sum(header.sizes), len(body))
-    ends = list(itertools.accumulate(header.sizes))
-    return [body[end - size : end] for end, size in zip(ends, header.sizes, strict=True)]
+def _leaves(file: Path, count: int, tree: bytes) -> np.ndarray:
+    """[N] whether a Gaussian is a leaf of a tree of levels of detail: the Gaussians that the others stand for."""
+    if len(tree) < TREE_BYTES * count:
+        raise cut_off(file, "the tree of levels of detail", TREE_BYTES * count, len(tree))
+    children = np.frombuffer(tree, "<u2", count).astype(np.int64)
+    starts = np.frombuffer(tree, "<u4", count, 2 * count).astype(np.int64)
+    is_whole = children.sum() == count - 1 and (starts + children)[children > 0].max(initial=0) <= count
+    if is_whole:  # all but the root have one parent
+        firsts = starts - (np.cumsum(children) - children)
+        parents = np.bincount(np.repeat(firsts, children) + np.arange(count - 1), minlength=1)
+        is_whole = parents.max() <= 1
+    if not is_whole:
+        problem = "has levels of detail that aren't one whole tree, as the files that build-lod --spz-chunked writes"
+        raise ImportFailed(file, f"{problem}; use what they were made of, or build-lod --spz")
+    return children == 0
 
 
-def _streams(file: Path, header: Header, contents: bytes) -> list[bytes]:
-    """The parts of version 4: a header of 32 bytes with the offset of a table of sizes, the table, the streams."""
-    if len(contents) < 32:
-        raise cut_off(file, "the header", 32, len(contents))
-    (table,) = struct.unpack_from("<I", contents, 16)
-    sizes = header.sizes if header.sh_degree else header.sizes[:5]
-    if header.streams < len(sizes):
-        raise ImportFailed(file, f"has {header.streams} streams; SH of degree {header.sh_degree} needs {len(sizes)}")
-    at = table + 16 * header.streams
-    if not table >= 32 or at > len(contents):
-        raise cut_off(file, "the table of streams", at, len(contents))
-    parts = []
-    for i, size in enumerate(sizes):
-        packed, unpacked = struct.unpack_from("<QQ", contents, table + 16 * i)
-        if unpacked != size:
-            raise ImportFailed(file, f"stream {i} has {unpacked:,} bytes; {header.count:,} Gaussians need {size:,}")
-        if at + packed > len(contents):
-            raise cut_off(file, f"stream {i}", packed, len(contents) - at)
-        parts.append(_zstd(file, i, contents[at : at + packed], size))
-        at += packed
-    return [*parts, b""][: len(header.sizes)]
-
-
-def _zstd(file: Path, number: int, packed: bytes, size: int) -> bytes:
-    if not size:
-        return b""
-    try:
-        stated = zstandard.frame_content_size(packed)
-        if stated not in (-1, size):
-            raise ImportFailed(file, f"stream {number} holds {stated:,} bytes instead of {size:,}")
-        found = bytearray()
-        with zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(packed) as reader:
-            while len(found) < size and (piece := reader.read(min(size - len(found), 1 << 24))):
-                found += piece
-    except zstandard.ZstdError as error:
-        raise ImportFailed(file, f"has a damaged zstd stream {number}: {error}") from error
-    if len(found) < size:
-        raise cut_off(file, f"stream {number}", size, len(found))
-    return bytes(found)
-
-
-def _decoded(file: Path, header: Header, parts: list[bytes], converted: bool) -> Splats:
-    positions, opacities, colors, scales, rotations, rest = (np.frombuffer(part, np.uint8) for part in parts)
+def _decoded(file: Path, found: Container, leaves: np.ndarray | None, system: str | None) -> Splats:
+    """The Gaussians, converted to the axes of a PLY if `system` names theirs."""
+    header = found.header
+    positions, alphas, colors, scales, rotations, rest = (np.frombuffer(part, np.uint8) for part in found.parts)
     n = header.count
     low, middle, high = positions.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
     fixed = ((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000  # two's complement of 24 bits
     dc = (colors.reshape(n, 1, 3) / 255 - 0.5) / COLOR_SCALE
     sh = np.concatenate([dc, (rest.reshape(n, -1, 3).astype(np.float64) - 128) / 128], axis=1)
     means, quats = fixed / 2**header.fractional_bits, _quats(header, rotations)
-    if converted:
+    log_scales, opacities = scales.reshape(n, 3) / 16 - 10, alphas / 255
+    if leaves is not None:  # opacities are halved, since those of inner nodes may be above 1
+        means, log_scales, quats, sh = (array[leaves] for array in (means, log_scales, quats, sh))
+        opacities = np.minimum(2 * opacities[leaves], 1)
+    if system == DEFAULT_SYSTEM:
         means, quats, sh = from_right_up_back(means, quats, sh)
-    return splats(
-        file,
-        means,
-        scales.reshape(n, 3) / 16 - 10,
-        quats,
-        opacities / 255,
-        sh,
-        "mip" if header.flags & MIP else "dilate",
-    )
+    elif system is not None:
+        means, quats, sh = from_system(system, means, quats, sh)
+    return splats(file, means, log_scales, quats, opacities, sh, "mip" if header.flags & MIP else "dilate")
 
 
 def _quats(header: Header, rotations: np.ndarray) -> np.ndarray:
