@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from export.importers.splats.ply_fields import PLY
 from msdgs_train.datasets.common.fields import FieldTable
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
-TABLES: tuple[FieldTable, ...] = ()
+TABLES: tuple[FieldTable, ...] = (PLY,)
 
 
 def documented(section: str) -> dict[str, str]:

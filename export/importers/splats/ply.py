@@ -80,13 +80,14 @@ def _up(comments: Sequence[str]) -> tuple[np.ndarray | None, list[str]]:
 
 def _gaussians(file: Path, columns: Columns) -> Splats:
     moves = is_spacetime(columns)
+    rest = rest_of(file, columns, columns.read)
+    sh = np.concatenate([_dc(columns, moves and not rest.size)[:, None], rest], axis=1)
     log_scales = columns.stack("scale_", 3 if columns.has("scale_2") else 2)
     if log_scales.shape[1] == 2:  # surfels of 2DGS
         log_scales = np.pad(log_scales, ((0, 0), (0, 1)), constant_values=-LOG_SCALE_LIMIT)
     opacities = sigmoid(columns.read("opacity"))
     if columns.has("filter_3D"):
         opacities, log_scales = _filtered(opacities, log_scales, columns.read("filter_3D"))
-    rest = rest_of(file, columns, columns.read)
     quats = columns.stack("rot_", 4)
     return splats(
         file,
@@ -94,7 +95,7 @@ def _gaussians(file: Path, columns: Columns) -> Splats:
         log_scales,
         quats,
         opacities,
-        np.concatenate([_dc(columns, moves and not rest.size)[:, None], rest], axis=1),
+        sh,
         motion=motion_of(file, columns, quats) if moves else None,
     )
 
