@@ -50,7 +50,7 @@ def splat_format(path: Path) -> str | None:
         return _by_start(start, name) or "spz"  # whose reader says what is wrong
     if path.name == META:
         return "sog"
-    names = _zip_names(path)
+    names = _zip_names(path, start)
     if any(name.rsplit("/", 1)[-1] == META for name in names):
         return "sog"
     return _by_start(start, splat_in_zip(path, names) or path.name)
@@ -107,15 +107,17 @@ def _by_start(start: bytes, name: str) -> str | None:
     return suffix if suffix in READERS else None
 
 
-def _zip_names(path: Path) -> list[str]:
+def _zip_names(path: Path, start: bytes) -> list[str]:
     """The names in a zip; none of other files."""
     try:
-        if not zipfile.is_zipfile(path):
-            return []
-        with zipfile.ZipFile(path) as archive:
-            return archive.namelist()
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                return archive.namelist()
     except ZIP_PROBLEMS:
         raise ImportFailed(path, "isn't a whole zip: its list of files can't be read") from None
+    if start.startswith(ZIP):
+        raise ImportFailed(path, "isn't a whole zip: it is cut off")
+    return []
 
 
 def _is_packed(path: Path, file_format: str) -> bool:
