@@ -13,7 +13,7 @@ from export.importers.detect import detect_format, frame_files
 from export.importers.errors import ImportFailed
 from export.importers.splats import formats
 from export.importers.splats.formats import read_splats
-from export.importers.splats.unpack import LEAST_LIMIT
+from export.importers.splats.unpack import MIN_LIMIT
 from tests.support.splat_files import FORMATS, inria_columns, ply_bytes, some_gaussians
 
 G = some_gaussians(20)
@@ -83,16 +83,20 @@ def test_gzips_of_numbered_files_are_a_sequence(tmp_path: Path):
     assert [file.name for file in frame_files(tmp_path)] == ["frame_2.ply.gz", "frame_10.ply.gz"]
 
 
+@pytest.mark.slow
 def test_an_archive_is_unpacked_in_a_process_of_its_own_and_keeps_all_that_was_read(tmp_path: Path):
-    commented = PLY.replace(b"element", b"comment Vertical Axis: z\ncomment antialiased 1\nelement", 1)
-    (tmp_path / "a.zip").write_bytes(zip_of({"a.ply": commented.replace(b"float nx", b"float other")}))
+    moving = {name: np.linspace(0, 1, 20) for name in ("unknown", "motion_0", "motion_1", "motion_2")}
+    moving |= {"trbf_center": np.zeros(20), "trbf_scale": np.zeros(20)}
+    commented = ply_bytes(inria_columns(G) | moving)
+    commented = commented.replace(b"element", b"comment Vertical Axis: z\ncomment antialiased 1\nelement", 1)
+    (tmp_path / "a.zip").write_bytes(zip_of({"a.ply": commented}))
     (tmp_path / "a.ply").write_bytes(commented)
     packed, plain = read_splats(tmp_path / "a.zip").to_arrays(), read_splats(tmp_path / "a.ply").to_arrays()
-    assert packed.keys() == plain.keys()
+    assert packed.keys() == plain.keys() >= {"up", "motion"}
     assert all(np.array_equal(array, packed[name]) for name, array in plain.items())
 
 
-BOMB = PLY + bytes(2 * LEAST_LIMIT)
+BOMB = PLY + bytes(2 * MIN_LIMIT)
 
 
 @pytest.mark.parametrize(

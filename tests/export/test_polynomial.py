@@ -58,6 +58,7 @@ def test_the_scene_follows_the_published_equations(tmp_path: Path, t: float):
         assert found.opacities[i] == pytest.approx(opacity, abs=tolerance("stored_frame"))
 
 
+@pytest.mark.slow
 def test_the_imported_file_is_compared_with_the_equations_and_can_be_converted(tmp_path: Path):
     options = ExportOptions(write(tmp_path, columns()), tmp_path / "a.onnx", duration=2.0, keep_float32=True)
     with model_or_import(options, QUIET):
@@ -69,6 +70,7 @@ def test_the_imported_file_is_compared_with_the_equations_and_can_be_converted(t
     convert(ConvertOptions(tmp_path / "a.onnx", tmp_path / "a.spz", t=0.5), QUIET)
 
 
+@pytest.mark.slow
 def test_all_moments_are_finite_if_quaternions_turn_through_0_and_motion_is_short(tmp_path: Path):
     stored = columns()
     for i in range(4):

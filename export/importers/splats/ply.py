@@ -38,14 +38,14 @@ def read_ply(file: Path) -> Splats:
         contents = PlyFile(file)
     except PlyInvalid as error:
         raise ImportFailed(file, str(error)) from None
-    vertex = Columns(file, contents, "vertex")
-    chunk, bands = (Columns(file, contents, name) if contents.element(name) else None for name in ("chunk", "sh"))
-    read = ("vertex", "chunk", "sh")
-    fields = [name for each in (vertex, chunk, bands) if each is not None for name in each.names]
-    fields += [each.name for each in contents.elements if each.count and each.name not in read]
-    warnings = checked_fields(file, fields)
+    columns = {"vertex": Columns(file, contents, "vertex")}
+    vertex = columns["vertex"]
     if vertex.has("packed_position"):
-        found = compressed(file, vertex, chunk, bands)
+        columns |= {name: Columns(file, contents, name) for name in ("chunk", "sh") if contents.element(name)}
+    others = [each.name for each in contents.elements if each.count and each.name not in columns]
+    warnings = checked_fields(file, [name for each in columns.values() for name in each.names] + others)
+    if vertex.has("packed_position"):
+        found = compressed(file, vertex, columns.get("chunk"), columns.get("sh"))
     else:
         found = _gaussians(file, vertex)
         warnings += [] if vertex.has("scale_2") else [SURFELS]

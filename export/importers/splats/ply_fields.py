@@ -60,5 +60,5 @@ def checked_fields(file: Path, names: Iterable[str]) -> list[str]:
             raise ImportFailed(file, f"has `{name}`, {what}; {AS_GAUSSIANS}")
     unlisted = PLY.unlisted(names)
     shown = ", ".join(f"`{name}`" for name in unlisted[:8]) + (f" and {len(unlisted) - 8} more" * (len(unlisted) > 8))
-    what = f"{shown}: no known part of a splat, and left out; if it changes the picture, {AS_GAUSSIANS}"
+    what = f"{shown}: no known part of a splat, and left out; if it changes the image, {AS_GAUSSIANS}"
     return [what] if unlisted else []

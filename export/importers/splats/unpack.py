@@ -12,7 +12,7 @@ from export.importers.splats.sog import ZIP_PROBLEMS
 GZIP, ZIP = b"\x1f\x8b\x08", b"PK\x03\x04"
 SUFFIXES = (".ply", ".spz", ".splat", ".ksplat", ".sog")
 
-MAX_FACTOR, LEAST_LIMIT = 64, 1 << 22
+MAX_FACTOR, MIN_LIMIT = 64, 1 << 22
 """An archive unpacks to so many times its own bytes at most; splats to 10 times, if many of their numbers are 0."""
 
 PIECE = 1 << 20
@@ -42,7 +42,7 @@ def gzip_start(path: Path, size: int) -> bytes:
 
 def unpack(path: Path, folder: Path) -> Path:
     """Write the splat of a zip or gzip into a folder. Raises `ImportFailed`."""
-    limit = max(MAX_FACTOR * path.stat().st_size, LEAST_LIMIT)
+    limit = max(MAX_FACTOR * path.stat().st_size, MIN_LIMIT)
     try:
         if not zipfile.is_zipfile(path):
             with gzip.open(path) as stream:

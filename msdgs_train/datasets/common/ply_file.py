@@ -50,7 +50,7 @@ class Element:
     def has_lists(self) -> bool:
         return any(each.length is not None for each in self.properties)
 
-    def least_bytes(self, is_text: bool) -> int:
+    def min_bytes(self, is_text: bool) -> int:
         """The fewest bytes that its rows take."""
         if is_text:
             return max(MIN_TEXT_BYTES * self.count * len(self.properties) - 1, 0)  # no separator at the end
@@ -92,11 +92,9 @@ class PlyFile:
         element = self.elements[number]
         if element.has_lists:
             raise PlyInvalid(f"has lists in `{name}`; a splat or a cloud of points has none")
-        if element.count and not element.properties:
-            raise PlyInvalid(f"has {element.count:,} rows of `{name}` without properties")
         skipped = self.elements[:number]
         size = self._path.stat().st_size
-        needed = sum(each.least_bytes(self.is_text) for each in (*skipped, element))
+        needed = sum(each.min_bytes(self.is_text) for each in (*skipped, element))
         if needed > size - self._start:
             raise _cut_off(element, needed, size - self._start)
         return self._text(element, skipped) if self.is_text else self._binary(element, skipped, size)
@@ -131,7 +129,7 @@ class PlyFile:
             return np.empty(0, kind)
         at = self._start
         for each in skipped:
-            at = self._after_lists(each, at) if each.has_lists and each.count else at + each.least_bytes(is_text=False)
+            at = self._after_lists(each, at) if each.has_lists and each.count else at + each.min_bytes(is_text=False)
         if at + element.count * kind.itemsize > size:
             raise _cut_off(element, element.count * kind.itemsize, max(size - at, 0))
         return np.memmap(self._path, kind, "r", at, (element.count,))
@@ -184,7 +182,9 @@ def _elements(lines: list[str]) -> tuple[Element, ...]:
                 elements[-1][2].append(Property(name, TYPES[kind]))
             case ["element" | "property", *_]:
                 raise PlyInvalid(f"has a header line that can't be read: {line[:80]!r}")
-    for name, _, properties in elements:
+    for name, count, properties in elements:
+        if count and not properties:
+            raise PlyInvalid(f"has {count:,} rows of `{name}` without properties")
         names = [each.name for each in properties]
         if twice := next((each for each in names if names.count(each) > 1), None):
             raise PlyInvalid(f"has the property `{twice}` of `{name}` twice")
