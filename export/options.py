@@ -1,5 +1,6 @@
 """The options of `to_onnx.py` and `convert.py`, without importing torch, so that `--help` is printed at once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +30,7 @@ class ExportOptions:
     Scenes of other programs are detected by their contents: INRIA's and SuperSplat's .ply, .spz, SOG, .splat and
     .ksplat, numbered sequences of them, and runs of Deformable-3D-Gaussians and 4DGaussians (docs/formats.md):
 
-    python export/to_onnx.py garden.ply -o scenes/garden.onnx
+    python export/to_onnx.py garden.ply -o scenes/garden.onnx --up z
 
     In seconds instead of minutes, all layers as trained, pruned:
 
@@ -74,6 +75,9 @@ class ExportOptions:
     """Seconds that the scene's time range lasts, which the file then says: the web page plays it at that speed."""
     times: int = 50
     """The number of times at which these are compared."""
+    up: Annotated[str | None, tyro.conf.arg(metavar="AXIS")] = None
+    """Which direction is up in a splat or a sequence: x, y, z, -x, -y, -z, or three numbers such as 0 -1 0.2. By
+    default what the file says, as those of ns-export do, otherwise -y."""
 
     @property
     def scene_file(self) -> Path:
@@ -131,6 +135,29 @@ class ConvertOptions:
     min_psnr: float | None = None
     """PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and Visionary,
     50 for scene files, and 60 for the others, which are lossless."""
+
+
+def with_values_of_up(arguments: Sequence[str]) -> list[str]:
+    """Arguments of a command in which `--up` and its value are one: -y looks like an option, and 0 -1 0 are three."""
+    joined: list[str] = []
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        if argument == "--up" and rest:
+            values = [rest.pop(0)]
+            while len(values) < 3 and rest and all(_is_number(each) for each in (*values, rest[0])):
+                values.append(rest.pop(0))
+            argument = f"--up={' '.join(values)}"
+        joined.append(argument)
+    return joined
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def require_folder_of(field: str, file: Path | None) -> None:

@@ -8,7 +8,7 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
 from export.command_line import Console, run, tyro
-from export.options import ExportOptions
+from export.options import ExportOptions, with_values_of_up
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.metadata import MAX_NUMBER
 
@@ -33,4 +33,4 @@ def main(options: ExportOptions) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(ExportOptions)))
+    sys.exit(main(tyro.cli(ExportOptions, args=with_values_of_up(sys.argv[1:]))))

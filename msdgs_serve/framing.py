@@ -13,6 +13,12 @@ MIN_CONVERGENCE = 0.02
 """Smallest mean squared sine of the angles between the viewing axes and their main direction at which their nearest
 point is well defined; below it they are too parallel."""
 
+NEAR_AXIS = 0.8
+"""Cosine to a world axis from where the mean of cameras' up directions means this axis."""
+
+LEVEL = 1e-9
+"""Mean squared cosine between up and the sideways axes of cameras, below which all of them are level."""
+
 ROUNDING = 1e-5
 """Rounding of the target, as a fraction of the bounds' diagonal: avoids long numbers in links."""
 
@@ -73,13 +79,18 @@ def _nearest_point(poses: np.ndarray, low: np.ndarray, high: np.ndarray, otherwi
 
 
 def _up(poses: np.ndarray) -> np.ndarray:
-    """Return the mean up direction of poses [N, 4, 4], or the world axis that is close to it."""
+    """Return the up direction of poses [N, 4, 4]: exactly, if they are level and look around, otherwise their mean or
+    the world axis that is close to it."""
     mean = -poses[:, :3, 1].mean(axis=0)
     length = float(np.linalg.norm(mean))
     if length < 1e-3:
         return np.array([0.0, 0.0, 1.0])
-    mean = mean / length
+    mean, close = mean / length, NEAR_AXIS
+    sideways = poses[:, :3, 0]
+    tilts, directions = np.linalg.eigh(sideways.T @ sideways / len(poses))  # of a level camera 0 along up
+    if tilts[0] < LEVEL and tilts[1] > MIN_CONVERGENCE:
+        mean, close = directions[:, 0] * np.sign(directions[:, 0] @ mean), 1 - LEVEL
     axis = int(np.argmax(np.abs(mean)))
-    if abs(mean[axis]) > 0.8:
+    if abs(mean[axis]) > close:
         return np.sign(mean[axis]) * np.eye(3)[axis]
     return mean

@@ -21,6 +21,7 @@ from msdgs_serve.files import Signature, move, sync
 from msdgs_serve.files import signature as signature_of
 from msdgs_serve.framing import Framing, framing
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
+from msdgs_serve.scene.foreign import START_BYTES, foreign_file
 from msdgs_serve.scene.metadata import SceneMetadata
 
 SUFFIX = ".onnx"
@@ -391,7 +392,9 @@ def _checked(path: Path) -> Path:
     if not path.is_file():
         raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}, which does not exist")
     if path.suffix != SUFFIX:
-        hint = "; `python export/to_onnx.py model.pt` turns a checkpoint into a scene" if path.suffix == ".pt" else ""
+        with path.open("rb") as file:
+            other = foreign_file(file.read(START_BYTES), str(path))
+        hint = f", which {other}" if other else ""
         raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}{hint}")
     if not is_servable_name(path.stem):
         raise InvalidInput("paths", "files with printable, unhidden names", repr(path.name))

@@ -38,6 +38,7 @@ LOSSLESS, LOSSY = 60.0, 45.0
 
 ONNX, VISIONARY = ".onnx", ".visionary.onnx"
 SINGLE = (".ply", ".spz", ".glb")
+COMPRESSED = ".compressed.ply"
 USD = (".usdc", ".usda", ".usd")
 VIDEOS = (".mp4", ".webm")
 PLACEMENT = "placement.json"
@@ -52,6 +53,10 @@ def convert(options: ConvertOptions, console: Console) -> None:
     out = options.out
     if out.suffix in VIDEOS:
         raise InvalidInput("out", f"other than a video: msdgs-render {options.scene} {out} writes one", out.name)
+    if out.name.lower().endswith(COMPRESSED):
+        raise InvalidInput(
+            "out", "without .compressed: SuperSplat's compressed PLY isn't written, .spz is small", out.name
+        )
     if out.suffix in (*SINGLE, *USD, ONNX):
         require_folder_of("out", out)
     if out.suffix == ONNX and options.t is not None:

@@ -1,18 +1,22 @@
 """The inputs of `to_onnx.py` other than a model.pt."""
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 from rich.console import Console
 
 from export.importers.detect import checked_format, detect_format, frame_files
+from export.importers.polynomial import at_time, polynomial_scene
 from export.importers.runs.model import RUNS, write_model
 from export.importers.scene import digest, note_left_out, static_scene, write_imported
 from export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
-from export.importers.splats.formats import READERS, read_splats
+from export.importers.splats.axes import up_direction
+from export.importers.splats.formats import READERS, read_splats, refuse_pointer
 from export.importers.splats.sog import META
 from export.measure.stability import MIN_PSNR
 from export.options import ExportOptions, require_folder_of
@@ -20,8 +24,11 @@ from export.progress import tracked
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
 
-FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep_float32", "duration")
+FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep_float32", "duration", "up")
 """The options that splats and sequences have; nothing is pruned or fitted."""
+
+POLYNOMIAL_TIMES = 9
+"""At which a scene of moving Gaussians is compared with its file."""
 
 
 @contextmanager
@@ -32,10 +39,14 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
     then None. Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
     """
     path, file_format, output = options.model, options.format, options.scene_file
+    if path.is_file():
+        refuse_pointer(path)
     if file_format == "detect":
         file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
     file_format = checked_format(file_format)
     require_folder_of("output", output)
+    if options.up is not None and file_format in ("model", *RUNS):
+        raise InvalidInput("up", "left out: it is for splats; a trained model is upright in its cameras", options.up)
     if file_format == "model":
         yield path / "model.pt" if path.is_dir() else path
     elif file_format in RUNS:
@@ -54,36 +65,66 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
         if options.keep_float32 and options.min_psnr is not None:
             raise InvalidInput("min_psnr", "left out with --keep-float32", options.min_psnr)
         min_psnr = None if options.keep_float32 else MIN_PSNR if options.min_psnr is None else options.min_psnr
+        imported = Import(path, file_format, output, min_psnr, None if options.up is None else _up(options.up))
         write = _splats if file_format in READERS else _sequence
-        _print(write(path, file_format, output, console, min_psnr), output, console)
+        _print(write(imported, console), output, console)
         yield None
 
 
-def _splats(path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None) -> BakedScene:
-    if file_format == "sog" and path.name == META:
+class Import(NamedTuple):
+    """The import of a splat or a sequence."""
+
+    path: Path
+    format: str
+    output: Path
+    min_psnr: float | None  # dB, of frames of packed arrays; None: arrays stay float32
+    up: np.ndarray | None  # [3] unit; None: what the file says
+
+
+def _up(text: str) -> np.ndarray:
+    found = up_direction(text)
+    if found is None:
+        raise InvalidInput("up", "x, y, z, -x, -y, -z or three finite numbers that aren't all 0", repr(text))
+    return found
+
+
+def _warn(warnings: Sequence[str], console: Console) -> None:
+    for warning in warnings:
+        console.print(f"warning: {warning}", markup=False)
+
+
+def _splats(job: Import, console: Console) -> BakedScene:
+    path = job.path
+    if job.format == "sog" and path.name == META:
         path = path.parent  # its limits and its digest are those of all files
     with console.status(f"reading {path}"):
-        source = read_splats(path, file_format)
-        for warning in source.warnings:
-            console.print(f"warning: {warning}", markup=False)
-        contents = static_scene(source, digest(path))
-        return write_imported(output, contents, lambda t: source.gaussians, [0.0], min_psnr=min_psnr)
+        source = read_splats(path, job.format)
+        _warn(source.warnings, console)
+        source = source if job.up is None else replace(source, up=job.up)
+        if source.motion is None:
+            scene = static_scene(source, digest(path))
+            return write_imported(job.output, scene, lambda t: source.gaussians, [0.0], min_psnr=job.min_psnr)
+        scene = polynomial_scene(source, digest(path))
+        times = np.linspace(0, 1, POLYNOMIAL_TIMES).tolist()
+        return write_imported(job.output, scene, lambda t: at_time(source, t), times, min_psnr=job.min_psnr)
 
 
-def _sequence(path: Path, file_format: str, output: Path, console: Console, min_psnr: float | None) -> BakedScene:
-    how = file_format.partition(":")[2] or None
+def _sequence(job: Import, console: Console) -> BakedScene:
+    how = job.format.partition(":")[2] or None
     with tracked(console) as track:
-        sequence = read_sequence(path, how, track("reading frames", len(frame_files(path))))
+        sequence = read_sequence(job.path, how, track("reading frames", len(frame_files(job.path))))
+        sequence = sequence if job.up is None else replace(sequence, up=job.up)
         times = sequence.times()
         scene = write_imported(
-            output,
-            sequence_scene(sequence, digest(path)),
+            job.output,
+            sequence_scene(sequence, digest(job.path)),
             lambda t: posed(sequence, times.index(t)),
             times,
             track("comparing frames", len(times)),
             rows=lambda t: shown_rows(sequence, times.index(t)),
-            min_psnr=min_psnr,
+            min_psnr=job.min_psnr,
         )
+    _warn(sequence.warnings, console)
     way = "blended" if sequence.blended else "switched, since they don't correspond or blending is off"
     console.print(f"{len(times)} frames, {way}")
     return scene

@@ -12,7 +12,7 @@ from msdgs_serve.scene.errors import InvalidInput
 FORMATS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *RUNS)
 """All inputs: our own model.pt, one set of Gaussians, a folder of them, and runs of other trainers."""
 
-FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat")
+FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat", ".ply.gz")
 
 
 def detect_format(path: Path) -> str:
@@ -44,7 +44,7 @@ def frame_files(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise ImportFailed(folder, "isn't a folder of frames")
-    files = sorted(f for f in folder.iterdir() if f.suffix.lower() in FRAMES and not f.name.startswith("."))
+    files = sorted(f for f in folder.iterdir() if f.name.lower().endswith(FRAMES) and not f.name.startswith("."))
     if len(files) < 2:
         return files
     names = [_name_and_numbers(file) for file in files]
@@ -63,7 +63,12 @@ def _name_and_numbers(file: Path) -> list[str]:
 
 
 def _model(path: Path) -> str | None:
-    return "model" if zipfile.is_zipfile(path) or path.suffix.lower() in (".pt", ".pth") else None
+    if path.suffix.lower() in (".pt", ".pth"):
+        return "model"
+    if not zipfile.is_zipfile(path):
+        return None
+    with zipfile.ZipFile(path) as archive:
+        return "model" if any(name.endswith("/data.pkl") for name in archive.namelist()) else None
 
 
 def _folder(path: Path) -> str | None:

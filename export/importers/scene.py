@@ -39,15 +39,20 @@ DISTANCE = 2.2
 def static_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     """The scene file of one set of Gaussians, in which nothing moves."""
     g = source.gaussians
-    metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped)
+    metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped, source.up)
     scene = BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
     return build(BASELINE, Baked(scene, Moving.none(), ()))
 
 
 def metadata_of(
-    means: np.ndarray, sh_degree: int, sha256: str, antialiasing: str = "dilate", dropped: int = 0
+    means: np.ndarray,
+    sh_degree: int,
+    sha256: str,
+    antialiasing: str = "dilate",
+    dropped: int = 0,
+    up: np.ndarray | None = None,
 ) -> SceneMetadata:
-    """Metadata for formats without any: bounds and cameras from the centers, black background."""
+    """Metadata for formats without any: bounds and cameras from the centers, these upright, black background."""
     low, high = (tuple(float(v) for v in np.quantile(means, part, axis=0)) for part in WITHIN)
     left_out = ()
     if dropped:
@@ -63,7 +68,7 @@ def metadata_of(
         delta_space="raw",
         background=(0.0, 0.0, 0.0),
         antialiasing=antialiasing,
-        cameras=cameras_around(np.array(low), np.array(high)),
+        cameras=cameras_around(np.array(low), np.array(high), UP if up is None else up),
         left_out=left_out,
         measured_error={},
         package_version=__version__,
@@ -71,10 +76,10 @@ def metadata_of(
     )
 
 
-def cameras_around(low: np.ndarray, high: np.ndarray) -> tuple[SceneCamera, ...]:
-    """Cameras on a circle around the middle of a box, with `UP` upwards."""
+def cameras_around(low: np.ndarray, high: np.ndarray, up: np.ndarray) -> tuple[SceneCamera, ...]:
+    """Cameras on a circle around the middle of a box, with `up` [3] upwards."""
     middle, reach = (low + high) / 2, max(half_diagonal((low, high)), 1e-3)
-    poses = [orbit(middle, DISTANCE * reach, 360 * i / CAMERAS, ELEVATION, UP) for i in range(CAMERAS)]
+    poses = [orbit(middle, DISTANCE * reach, 360 * i / CAMERAS, ELEVATION, up) for i in range(CAMERAS)]
     return tuple(
         SceneCamera(f"around {i}", 0.0, Camera.from_fov(pose, SIZE, SIZE, FOV_Y)) for i, pose in enumerate(poses)
     )

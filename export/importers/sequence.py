@@ -55,6 +55,8 @@ class Frames:
     dropped: int
     antialiasing: str
     blended: bool
+    up: np.ndarray | None = None  # [3] unit, if a file says so
+    warnings: tuple[str, ...] = ()  # of the files, each once
 
     def times(self) -> list[float]:
         """The times of the frames."""
@@ -90,6 +92,8 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     read: list[Splats] = []
     for file in files:
         read.append(read_splats(file))
+        if read[-1].motion is not None:
+            raise ImportFailed(folder, f"{file.name} has Gaussians that move by themselves, and is a scene alone")
         if sum(map(len, read)) > MAX_GAUSSIANS:
             raise ImportFailed(
                 folder, f"has more than {MAX_GAUSSIANS:,} Gaussians in {len(read)} of {len(files)} frames"
@@ -99,11 +103,16 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     if len(modes) > 1 or len(degrees) > 1:
         found = f"anti-aliasing {sorted(modes)} and SH of degrees {sorted(degrees)}"
         raise ImportFailed(folder, f"its frames differ in properties of the whole scene: {found}")
+    ups = {tuple(each.up.tolist()): each.up for each in read if each.up is not None}
+    if len(ups) > 1:
+        raise ImportFailed(folder, f"its frames say that different directions are up: {sorted(ups)}")
     frames, dropped = tuple(each.gaussians for each in read), sum(each.dropped for each in read)
     problem = None if how == "switch" else _why_not_blended(frames, any(each.dropped for each in read))
     if how == "blend" and problem:
         raise ImportFailed(folder, f"can't be blended: {problem}")
-    return Frames(frames, dropped, read[0].antialiasing, problem is None and how != "switch")
+    warnings = tuple(dict.fromkeys(warning for each in read for warning in each.warnings))
+    blended = problem is None and how != "switch"
+    return Frames(frames, dropped, read[0].antialiasing, blended, next(iter(ups.values()), None), warnings)
 
 
 def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:
@@ -170,7 +179,8 @@ def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
     frames = sequence.gaussians
     moving, static = sequence.parts
     first, count = frames[0], len(frames)
-    metadata = metadata_of(np.concatenate([f.means for f in frames]), first.sh_degree, sha256, sequence.antialiasing)
+    means = np.concatenate([f.means for f in frames])
+    metadata = metadata_of(means, first.sh_degree, sha256, sequence.antialiasing, up=sequence.up)
     changing, order = sequence.changing, np.concatenate([moving, static])
     stored = {name: getattr(first, name)[static if name in changing else order] for name in APPEARANCE}
     scene = BakedScene(
@@ -224,7 +234,7 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
         np.concatenate([getattr(frame, name) for frame in frames])
         for name in ("means", "quats", "scales", "opacities", "sh")
     )
-    metadata = metadata_of(means, frames[0].sh_degree, sha256, sequence.antialiasing, sequence.dropped)
+    metadata = metadata_of(means, frames[0].sh_degree, sha256, sequence.antialiasing, sequence.dropped, sequence.up)
     plan = f"frames:{len(frames)}"
     empty = np.empty((0, 3), np.float32)
     scene = BakedScene(
@@ -233,7 +243,9 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
     baked = Baked(scene, Moving(means, scales, quats), ())
     graph = new_graph(baked)
     low, high = np.array(metadata.bounds)
-    parked = (low + high) / 2 - PARKED_AT * max(half_diagonal(metadata.bounds), 1e-3) * UP
+    parked = (low + high) / 2 - PARKED_AT * max(half_diagonal(metadata.bounds), 1e-3) * (
+        UP if sequence.up is None else sequence.up
+    )
 
     half = graph.constant("frames.half", np.array([0.5], np.float32))
     last = graph.constant("frames.last", np.array([len(frames) - 1], np.float32))

@@ -8,6 +8,7 @@ import numpy as np
 
 from msdgs_serve.scene.baked import APPEARANCE, OPTIONAL_INPUT, constant_outputs
 from msdgs_serve.scene.errors import SceneFileInvalid
+from msdgs_serve.scene.foreign import START_BYTES, foreign_file
 from msdgs_serve.scene.metadata import CONTRACT, SceneMetadata
 from msdgs_serve.scene.onnx import (
     UNLIMITED,
@@ -89,6 +90,8 @@ def read_scene_file(contents: bytes, file: str, limits: GraphLimits) -> SceneFil
         metadata = SceneMetadata.from_properties(model.properties, file)
         return _read(model, metadata, limits)
     except ModelInvalid as error:
+        if other := foreign_file(contents[:START_BYTES], file):
+            raise SceneFileInvalid(file, "file", other) from None
         raise SceneFileInvalid(file, error.field, error.problem) from None
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.foreign import LFS_POINTER, START_BYTES, is_lfs_pointer
 from msdgs_train.datasets.common.files import replacing
 
 PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
@@ -36,6 +37,9 @@ def load(path: str | Path) -> Any:
         size = path.stat().st_size
         if size == 0:
             raise CheckpointInvalid(path, "is empty")
+        with path.open("rb") as file:
+            if is_lfs_pointer(file.read(START_BYTES)):
+                raise CheckpointInvalid(path, LFS_POINTER)
         if not zipfile.is_zipfile(path):
             raise CheckpointInvalid(path, f"isn't a torch checkpoint, or is cut off after {size:,} bytes")
         with zipfile.ZipFile(path) as archive:
@@ -50,7 +54,7 @@ def load(path: str | Path) -> Any:
     except CheckpointInvalid:
         raise
     except Exception as error:  # a damaged pickle raises errors of any type
-        raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
+        raise CheckpointInvalid(path, "isn't a whole torch checkpoint of tensors and plain values alone") from error
 
 
 def refuse_unlike_stored(path: str | Path, tensors: Mapping[str, Tensor]) -> None:

@@ -370,3 +370,9 @@ def test_an_option_without_effect_and_a_missing_folder_are_refused(tmp_path: Pat
         run(scene, tmp_path / "b.onnx", 0.5)
     with pytest.raises(InvalidInput, match="`out` must be in a folder that exists"):
         run(scene, tmp_path / "nowhere" / "a.ply")
+
+
+@pytest.mark.parametrize("name", ["a.compressed.ply", "A.Compressed.PLY", "new.folder.compressed.ply"])
+def test_a_compressed_ply_is_not_written(tmp_path: Path, name: str):
+    with pytest.raises(InvalidInput, match=r"`out` must be without \.compressed: .* compressed PLY isn't written"):
+        convert(ConvertOptions(tmp_path / "scene.onnx", tmp_path / name), Console(quiet=True))

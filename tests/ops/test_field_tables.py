@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from export.importers.splats import ksplat, sog, splat, spz_container
-from msdgs_train.datasets.common.fields import FieldTable
+from export.importers.splats import ksplat, ply_fields, sog, splat, spz_container
+from msdgs_serve.scene.fields import FieldTable
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
-TABLES: tuple[FieldTable, ...] = (spz_container.FIELDS, sog.FIELDS, ksplat.FIELDS, splat.FIELDS)
+TABLES: tuple[FieldTable, ...] = (ply_fields.PLY, spz_container.FIELDS, sog.FIELDS, ksplat.FIELDS, splat.FIELDS)
 
 
 def documented(section: str) -> dict[str, str]:

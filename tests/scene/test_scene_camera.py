@@ -180,3 +180,15 @@ def test_cameras_side_by_side_leave_the_middle_of_the_bounds(sideways: float):
 def test_cameras_that_look_away_from_each_other_leave_the_middle_of_the_bounds():
     poses = [orbit(CENTER, 0.1, azimuth, 20, UP) @ np.diag([-1.0, 1.0, -1.0, 1.0]) for azimuth in (0, 70, 200)]
     assert_close(framing(seen_by(*poses)).target, [0, 4, 3], "rotation")
+
+
+@pytest.mark.parametrize("up", [(0.1, -0.9, 0.3), (0.0, 0.05, 1.0), (0.0, 0.0, -1.0)])
+def test_level_cameras_that_look_around_say_exactly_what_is_up(up: tuple[float, ...]):
+    unit = np.array(up) / np.linalg.norm(up)
+    poses = [orbit(CENTER, 4.0, azimuth, 20, unit) for azimuth in (0, 70, 200)]
+    assert_close(framing(seen_by(*poses)).up, unit, "rotation")
+    assert np.array_equal(np.abs(framing(seen_by(*poses)).up), (0, 0, 1)) == (max(abs(unit)) == 1)
+
+
+def test_a_single_camera_that_looks_down_means_the_axis_close_to_its_up():
+    assert_close(framing(seen_by(orbit(CENTER, 4.0, 30, 30, UP))).up, UP, "rotation")

@@ -18,7 +18,7 @@ from export.importers.runs.fourdgs import FourDGSImporter
 from export.importers.runs.state import RunFolder
 from export.importers.scene import metadata_of
 from export.importers.splats.base import Splats, as_float32, logit
-from export.importers.splats.formats import read_splats
+from export.importers.splats.formats import read_splats, refuse_pointer
 from export.measure.poses import posed
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
@@ -53,9 +53,15 @@ def write_model(run: Path, file_format: str, output: Path, console: Console) -> 
     if not clouds:
         raise ImportFailed(run, "has no point_cloud/iteration_*/point_cloud.ply")
     iteration, importer = max(clouds), RUNS[file_format]
+    for name in ("cfg_args", "cameras.json"):
+        refuse_pointer(run / name)
     source = read_splats(clouds[iteration], "ply")
+    for warning in source.warnings:
+        console.print(f"warning: {warning}", markup=False)
     if source.dropped:
         raise ImportFailed(clouds[iteration], f"{source.dropped:,} Gaussians hold NaN, infinity or no direction")
+    if source.motion is not None:
+        raise ImportFailed(clouds[iteration], "has Gaussians that move by themselves, unlike those of such a run")
     folder = RunFolder(run, iteration, importer.networks)
     model, notes = importer.read(folder, canonical(source))
     for t in np.linspace(0, 1, CHECKED_TIMES).tolist():

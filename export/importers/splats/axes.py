@@ -1,5 +1,7 @@
-"""Conversion from axes right, up, back of some formats to right, down, front of INRIA's PLY and this project."""
+"""Conversion from axes right, up, back of some formats to right, down, front of INRIA's PLY and this project; and
+directions that are up, as texts."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,6 +19,23 @@ def from_right_up_back(means: np.ndarray, quats: np.ndarray, sh: np.ndarray) -> 
 def upright(up: np.ndarray) -> list[float]:
     """The quaternion xyzw of the rotation that makes y up, after `from_right_up_back`, in a scene of this `up`, [3]."""
     return Rotation.align_vectors([[0.0, 1.0, 0.0]], [up * (1, -1, -1)])[0].as_quat().tolist()
+
+
+def up_direction(text: str) -> np.ndarray | None:
+    """[3] unit, of an axis such as `z`, `-y` or `+Y` or of three numbers, as options and headers of files have it; None
+    for anything else."""
+    if axis := re.fullmatch(r"\s*([+-]?)\s*([xyz])(?:[ _-]?up)?\s*", text, re.IGNORECASE):
+        return (-1.0 if axis[1] == "-" else 1.0) * np.eye(3)["xyz".index(axis[2].lower())]
+    words = text.strip().strip("()[]").replace(",", " ").split()
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError:
+        return None
+    largest = np.abs(numbers).max(initial=0)
+    if len(numbers) != 3 or not np.isfinite(largest) or largest == 0:
+        return None
+    scaled = numbers / largest  # squares of large and small numbers are out of range
+    return scaled / np.linalg.norm(scaled)
 
 
 def upright_offset(offset: Sequence[float], up: np.ndarray) -> list[float]:

@@ -32,6 +32,8 @@ class Splats:
     antialiasing: str = "dilate"  # or "mip", if the file says so
     quat_lengths: FloatArray | None = None  # [N] of the stored quaternions; None: all 1
     warnings: tuple[str, ...] = ()  # what a user should know about the file, each one sentence
+    up: np.ndarray | None = None  # [3] unit, if the file says so
+    motion: FloatArray | None = None  # [N, 15] if its Gaussians move by themselves: `spacetime.COLUMNS`
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -47,9 +49,8 @@ class Splats:
         names = [field.name for field in fields(Gaussians)]
         gaussians = Gaussians(*(arrays[name] for name in names)).validate()
         warnings = tuple(str(each) for each in arrays["warnings"])
-        return Splats(
-            gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), arrays.get("quat_lengths"), warnings
-        )
+        own = {name: arrays.get(name) for name in ("quat_lengths", "up", "motion")}
+        return Splats(gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), warnings=warnings, **own)
 
 
 def splats(
@@ -60,9 +61,10 @@ def splats(
     opacities: np.ndarray,
     sh: np.ndarray,
     antialiasing: str = "dilate",
+    motion: np.ndarray | None = None,
 ) -> Splats:
     """Activate stored Gaussians: means [N, 3], log_scales [N, 3], raw_quats [N, 4] wxyz of any norm, opacities [N] in
-    [0, 1] and sh [N, C, 3].
+    [0, 1] and sh [N, C, 3]; `motion`, [N, 15], is kept as it is.
 
     Rows with NaN, infinity, values beyond the limits above or a quaternion of norm under 1e-8 are dropped and counted;
     log-scales are clamped to ±20. Raises `ImportFailed` if no row is left.
@@ -77,6 +79,8 @@ def splats(
             & ~np.isnan(opacities)
             & (np.abs(sh) <= MAX_SH).all(axis=(1, 2))
         )
+        if motion is not None:
+            good &= (np.abs(motion) <= MAX_DISTANCE).all(axis=1)
     count = int(good.sum())
     if not count:
         problem = "holds no Gaussians" if not len(good) else f"none of its {len(good):,} Gaussians can be drawn"
@@ -90,7 +94,8 @@ def splats(
         as_float32(opacities[rows].clip(0, 1)),
         as_float32(sh[rows]),
     )
-    return Splats(gaussians.validate(), len(good) - count, antialiasing, as_float32(norms[rows]))
+    moving = None if motion is None else as_float32(motion[rows])
+    return Splats(gaussians.validate(), len(good) - count, antialiasing, as_float32(norms[rows]), motion=moving)
 
 
 def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 
 from export.importers.errors import ImportFailed, cut_off
 from export.importers.splats.base import Splats, splats
+from msdgs_serve.scene.fields import FieldTable
 from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
-from msdgs_train.datasets.common.fields import FieldTable
 
 FIELDS = FieldTable(
     ".ksplat",

@@ -13,7 +13,7 @@ import numpy as np
 from export.importers.errors import ImportFailed
 from export.importers.splats.base import Splats, smallest_three, splats
 from export.importers.splats.webp import read_texture
-from msdgs_train.datasets.common.fields import FieldTable
+from msdgs_serve.scene.fields import FieldTable
 
 FIELDS = FieldTable(
     "SOG",

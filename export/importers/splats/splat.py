@@ -6,8 +6,8 @@ import numpy as np
 
 from export.importers.errors import ImportFailed
 from export.importers.splats.base import Splats, splats
+from msdgs_serve.scene.fields import FieldTable
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_train.datasets.common.fields import FieldTable
 
 FIELDS = FieldTable(
     ".splat",

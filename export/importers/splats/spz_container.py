@@ -12,7 +12,7 @@ from typing import NamedTuple
 import zstandard
 
 from export.importers.errors import ImportFailed, cut_off
-from msdgs_train.datasets.common.fields import FieldTable
+from msdgs_serve.scene.fields import FieldTable
 
 FIELDS = FieldTable(
     "SPZ",

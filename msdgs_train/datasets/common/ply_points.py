@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
+from msdgs_train.datasets.common.ply_file import PlyFile, PlyInvalid
 from msdgs_train.datasets.common.readers import DatasetInvalid, finite_rows
 
 POSITION, COLOR = ("x", "y", "z"), ("red", "green", "blue")
@@ -17,13 +17,11 @@ def read_ply_points(file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
     divided by the largest value of their type. Raises `DatasetInvalid` naming file and field.
     """
     try:
-        vertices = PlyData.read(str(file))["vertex"].data
+        vertices = PlyFile(file).read("vertex")
     except OSError as error:
         raise DatasetInvalid(file, "file", f"can't be read: {error.strerror}") from None
-    except KeyError:
-        raise DatasetInvalid(file, "element", "vertex is missing") from None
-    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
-        raise DatasetInvalid(file, "file", f"is not a complete PLY file: {error}") from None
+    except PlyInvalid as error:
+        raise DatasetInvalid(file, "file", str(error)) from None
     for name in POSITION:
         if name not in (vertices.dtype.names or ()) or vertices.dtype[name].kind not in "fiu":
             raise DatasetInvalid(file, f"property {name}", "is missing or not a number")

@@ -209,3 +209,10 @@ def test_an_interrupted_save_leaves_the_old_file_alone(model_file: Path):
         save_atomic(model_file, {"tensor": torch.zeros(1000), "then": Unsavable()})
     assert model_file.read_bytes() == before
     assert list(model_file.parent.iterdir()) == [model_file]
+
+
+@pytest.mark.parametrize("content", [b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 1\n"])
+def test_a_pointer_of_git_lfs_is_called_one(tmp_path: Path, content: bytes):
+    (tmp_path / "model.pt").write_bytes(content)
+    with pytest.raises(CheckpointInvalid, match=r"model\.pt: is a Git LFS pointer, .*`git lfs pull`"):
+        load_model(tmp_path / "model.pt")
