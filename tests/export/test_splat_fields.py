@@ -318,6 +318,7 @@ def test_each_field_is_used_as_its_table_says(tmp_path: Path, name: str, field: 
         (spz4_bytes(SPZ, {0xADBE0003: bytes(4)}), "its coordinate system is unspecified"),
         (spz4_bytes(SPZ, {0xADBE0003: b"\x0a\0\0\0"}), "its coordinate system RFD is read as RBU"),
     ],
+    ids=lambda value: "spz" if isinstance(value, bytes) else value,
 )
 def test_what_an_spz_says_in_unknown_words_is_warned_about(tmp_path: Path, contents: bytes, warning: str):
     (tmp_path / "a.spz").write_bytes(contents)
