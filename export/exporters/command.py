@@ -120,7 +120,7 @@ def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: fl
             write_ply(temporary, gaussians, metadata.antialiasing)
         else:
             write_gltf(temporary, gaussians, framing(metadata).up, place.offset)
-        written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).gaussians
+        written = read_gltf(temporary) if file.suffix == ".glb" else read_splats(temporary).around(np.zeros(3))
         psnr = RoundTrip(session).psnr(written.scaled(1 / scale), t)
         require(psnr, options.min_psnr, LOSSY if file.suffix == ".spz" else LOSSLESS, file.name)
     return psnr

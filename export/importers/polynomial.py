@@ -15,6 +15,7 @@ from export.trajectories.poses import POSE
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_serve.scene.similarity import IDENTITY, Similarity
 
 PLAN = "polynomial"
 CHANGING = ("opacities",)
@@ -23,7 +24,8 @@ CHANGING = ("opacities",)
 def polynomial_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     """The scene file, in which all Gaussians move and all opacities change."""
     g, motion = source.gaussians, _motion(source)
-    metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped, source.up)
+    place = IDENTITY if source.offset is None else Similarity(1.0, tuple(source.offset.tolist()))
+    metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped, source.up, place)
     three = np.empty((0, 3), np.float32)
     appearance = (np.empty(0, np.float32), g.sh)
     static = (three, np.empty((0, 4), np.float32), three)

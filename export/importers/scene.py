@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import onnx
 
+from export.importers.placement import placement
 from export.importers.splats.base import Splats
 from export.jobs.bake import Baked, Moving
 from export.jobs.store import stored_anew
@@ -21,6 +22,7 @@ from msdgs_serve.scene.baked import CONTRACT, MOVING_OUTPUTS, BakedScene, SceneC
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
+from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.datasets.common.files import replacing
 
 WITHIN = (0.01, 0.99)
@@ -38,8 +40,9 @@ DISTANCE = 2.2
 
 def static_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     """The scene file of one set of Gaussians, in which nothing moves."""
-    g = source.gaussians
-    metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped, source.up)
+    place = placement([source.gaussians], source.offset)
+    g = source.gaussians.scaled(1 / place.scale)
+    metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped, source.up, place)
     scene = BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
     return build(BASELINE, Baked(scene, Moving.none(), ()))
 
@@ -51,8 +54,10 @@ def metadata_of(
     antialiasing: str = "dilate",
     dropped: int = 0,
     up: np.ndarray | None = None,
+    place: Similarity = IDENTITY,
 ) -> SceneMetadata:
-    """Metadata for formats without any: bounds and cameras from the centers, these upright, black background."""
+    """Metadata for formats without any: bounds and cameras from the centers, these upright, black background; `place`
+    is that of the centers in the files' world."""
     low, high = (tuple(float(v) for v in np.quantile(means, part, axis=0)) for part in WITHIN)
     left_out = ()
     if dropped:
@@ -73,6 +78,7 @@ def metadata_of(
         measured_error={},
         package_version=__version__,
         checkpoint_sha256=sha256,
+        scene_to_world=place,
     )
 
 
@@ -131,6 +137,7 @@ def changed_metadata(file: Path, **changes: Any) -> None:
 
 def _differences(session: DeformationSession, expected: Gaussians, t: float, rows: slice) -> dict[str, float]:
     got = session.gaussians(t)
+    expected = expected.scaled(1 / session.scene.metadata.scene_to_world.scale)
     means, quats, scales = (getattr(got, name)[rows] for name in MOVING_OUTPUTS)
     size = half_diagonal(session.scene.metadata.bounds)
     far = np.maximum(np.abs(expected.means.astype(np.float64)).max(axis=1, initial=0), size)

@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from export.importers.detect import frame_files
 from export.importers.errors import ImportFailed
+from export.importers.placement import placement
 from export.importers.scene import UP, metadata_of
 from export.importers.splats.base import Splats
 from export.importers.splats.formats import read_splats
@@ -30,6 +31,7 @@ from export.trajectories.splines import design
 from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 from msdgs_serve.scene.baked import APPEARANCE, MOVING_OUTPUTS, BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.similarity import Similarity
 from msdgs_train.gaussians.scale_space import MIN_SCALE
 
 CONSTANT = 0.02
@@ -57,6 +59,7 @@ class Frames:
     blended: bool
     up: np.ndarray | None = None  # [3] unit, if a file says so
     warnings: tuple[str, ...] = ()  # of the files, each once
+    offset: np.ndarray | None = None  # [3] float64, of the Gaussians' origin in the files, if they are far from its own
 
     def times(self) -> list[float]:
         """The times of the frames."""
@@ -106,18 +109,22 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     ups = {tuple(each.up.tolist()): each.up for each in read if each.up is not None}
     if len(ups) > 1:
         raise ImportFailed(folder, f"its frames say that different directions are up: {sorted(ups)}")
-    frames, dropped = tuple(each.gaussians for each in read), sum(each.dropped for each in read)
+    offset = next((each.offset for each in read if each.offset is not None), None)
+    origin = np.zeros(3) if offset is None else offset
+    frames, dropped = tuple(each.around(origin) for each in read), sum(each.dropped for each in read)
     problem = None if how == "switch" else _why_not_blended(frames, any(each.dropped for each in read))
     if how == "blend" and problem:
         raise ImportFailed(folder, f"can't be blended: {problem}")
     warnings = tuple(dict.fromkeys(warning for each in read for warning in each.warnings))
     blended = problem is None and how != "switch"
-    return Frames(frames, dropped, read[0].antialiasing, blended, next(iter(ups.values()), None), warnings)
+    return Frames(frames, dropped, read[0].antialiasing, blended, next(iter(ups.values()), None), warnings, offset)
 
 
 def sequence_scene(sequence: Frames, sha256: str) -> onnx.ModelProto:
     """The scene file of a sequence."""
-    return _blended(sequence, sha256) if sequence.blended else _switched(sequence, sha256)
+    place = placement(sequence.gaussians, sequence.offset)
+    sequence = replace(sequence, gaussians=tuple(frame.scaled(1 / place.scale) for frame in sequence.gaussians))
+    return (_blended if sequence.blended else _switched)(sequence, sha256, place)
 
 
 def posed(sequence: Frames, number: int) -> Gaussians:
@@ -175,12 +182,12 @@ def _neighbors_stay(now: np.ndarray, later: np.ndarray) -> bool:
     return float(np.quantile(then / np.maximum(own, 1e-3 * size), 0.9)) <= APART
 
 
-def _blended(sequence: Frames, sha256: str) -> onnx.ModelProto:
+def _blended(sequence: Frames, sha256: str, place: Similarity) -> onnx.ModelProto:
     frames = sequence.gaussians
     moving, static = sequence.parts
     first, count = frames[0], len(frames)
     means = np.concatenate([f.means for f in frames])
-    metadata = metadata_of(means, first.sh_degree, sha256, sequence.antialiasing, up=sequence.up)
+    metadata = metadata_of(means, first.sh_degree, sha256, sequence.antialiasing, up=sequence.up, place=place)
     changing, order = sequence.changing, np.concatenate([moving, static])
     stored = {name: getattr(first, name)[static if name in changing else order] for name in APPEARANCE}
     scene = BakedScene(
@@ -228,13 +235,15 @@ def _through(count: int) -> np.ndarray:
     return np.linalg.inv(np.concatenate([rows, ends]))[:, :count]
 
 
-def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
+def _switched(sequence: Frames, sha256: str, place: Similarity) -> onnx.ModelProto:
     frames = sequence.gaussians
     means, quats, scales, opacities, sh = (
         np.concatenate([getattr(frame, name) for frame in frames])
         for name in ("means", "quats", "scales", "opacities", "sh")
     )
-    metadata = metadata_of(means, frames[0].sh_degree, sha256, sequence.antialiasing, sequence.dropped, sequence.up)
+    metadata = metadata_of(
+        means, frames[0].sh_degree, sha256, sequence.antialiasing, sequence.dropped, sequence.up, place
+    )
     plan = f"frames:{len(frames)}"
     empty = np.empty((0, 3), np.float32)
     scene = BakedScene(
@@ -249,8 +258,8 @@ def _switched(sequence: Frames, sha256: str) -> onnx.ModelProto:
 
     half = graph.constant("frames.half", np.array([0.5], np.float32))
     last = graph.constant("frames.last", np.array([len(frames) - 1], np.float32))
-    place = graph.node("Add", [graph.node("Mul", ["t", last], "frames.place"), half], "frames.rounded")
-    number = graph.node("Cast", [graph.node("Floor", [place], "frames.floor")], "frames.now", to=TensorProto.INT64)
+    at = graph.node("Add", [graph.node("Mul", ["t", last], "frames.place"), half], "frames.rounded")
+    number = graph.node("Cast", [graph.node("Floor", [at], "frames.floor")], "frames.now", to=TensorProto.INT64)
     of = np.repeat(np.arange(len(frames)), [len(frame) for frame in frames])
     own = graph.node("Gather", [graph.constant("frames.of", of), "ids"], "ids.frame")
     column = graph.constant("frames.column", np.array([1], np.int64))

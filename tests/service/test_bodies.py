@@ -27,6 +27,7 @@ def client(scene: Path) -> Iterator[httpx.Client]:
     "content",
     [b"", b"nope", b"{", b'{"t": }', b"{'t': 1}", b'{"t": 1,}', b"[]", b"[{}]", b"null", b'"x"', b"5", b"true", b"NaN",
      b"\xff\xfe", b"\x80{}", b"[" * 5000, b'{"a":' * 5000, b"\x89PNG\r\n", b'{"t":"\n"}'],
+    ids=lambda content: repr(content[:12]),
 )  # fmt: skip
 def test_a_body_that_is_no_json_object(client: httpx.Client, path: str, content: bytes):
     for kind in ("application/json", "text/plain", "application/x-www-form-urlencoded", "image/png"):

@@ -27,6 +27,7 @@ TABLE = (
     Row("pixel.placed", 1e-6, "as placed, times focal lengths of 60 pixels"),
     Row("normalized.scale", 6e-3, "scales and offsets are rounded to three digits"),
     Row("normalized.center", 2e-2, "as normalized.scale, for distances of 4"),
+    Row("placed_splat_db", 60.0, "float32 after another scale and offset, rounded 1e-7 of the extent: 1e-5 of a pixel"),
     Row("placed_run_db", 0.5, "scales rounded to three digits move initial Gaussians by up to half a per cent"),
     # 16 numbers at once
     Row("vectors.float32", 3e-5, "some roundings of numbers and sums up to 100; NumPy rounds products first"),

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,8 @@ def write_model(run: Path, file_format: str, output: Path, console: Console) -> 
     for name in ("cfg_args", "cameras.json"):
         refuse_pointer(run / name)
     source = read_splats(clouds[iteration], "ply")
+    # networks read the file's coordinates
+    source = replace(source, gaussians=source.around(np.zeros(3)), offset=None)
     for warning in source.warnings:
         console.print(f"warning: {warning}", markup=False)
     if source.dropped:

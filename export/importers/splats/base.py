@@ -1,11 +1,12 @@
 """The result of all readers of splat files: activated Gaussians without those that can't be drawn."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from export.importers.errors import ImportFailed
+from export.importers.placement import far_offset
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.quaternion import MIN_NORM
 
@@ -33,10 +34,18 @@ class Splats:
     quat_lengths: FloatArray | None = None  # [N] of the stored quaternions; None: all 1
     warnings: tuple[str, ...] = ()  # what a user should know about the file, each one sentence
     up: np.ndarray | None = None  # [3] unit, if the file says so
+    offset: np.ndarray | None = None  # [3] float64, of the Gaussians' origin in the file, if they are far from its own
     motion: FloatArray | None = None  # [N, 15] if its Gaussians move by themselves: `spacetime.COLUMNS`
 
     def __len__(self) -> int:
         return len(self.gaussians)
+
+    def around(self, origin: np.ndarray) -> Gaussians:
+        """The Gaussians with centers relative to a point of the file's world, [3]."""
+        moved = (np.zeros(3) if self.offset is None else self.offset) - origin
+        return (
+            replace(self.gaussians, means=as_float32(self.gaussians.means + moved)) if moved.any() else self.gaussians
+        )
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The fields by name, for `from_arrays`."""
@@ -49,7 +58,7 @@ class Splats:
         names = [field.name for field in fields(Gaussians)]
         gaussians = Gaussians(*(arrays[name] for name in names)).validate()
         warnings = tuple(str(each) for each in arrays["warnings"])
-        own = {name: arrays.get(name) for name in ("quat_lengths", "up", "motion")}
+        own = {name: arrays.get(name) for name in ("quat_lengths", "up", "offset", "motion")}
         return Splats(gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), warnings=warnings, **own)
 
 
@@ -67,7 +76,7 @@ def splats(
     [0, 1] and sh [N, C, 3]; `motion`, [N, 15], is kept as it is.
 
     Rows with NaN, infinity, values beyond the limits above or a quaternion of norm under 1e-8 are dropped and counted;
-    log-scales are clamped to ±20. Raises `ImportFailed` if no row is left.
+    log-scales are clamped to ±20. Means far from the origin are moved to it: `Splats.offset`. Raises `ImportFailed` if no row is left.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norms = np.linalg.norm(raw_quats.astype(np.float64), axis=1)
@@ -86,16 +95,19 @@ def splats(
         problem = "holds no Gaussians" if not len(good) else f"none of its {len(good):,} Gaussians can be drawn"
         raise ImportFailed(file, problem)
     rows = slice(None) if count == len(good) else good
+    centers = means[rows].astype(np.float64)
+    offset = far_offset(centers)
     scales = np.exp(log_scales[rows].astype(np.float64).clip(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
     gaussians = Gaussians(
-        as_float32(means[rows]),
+        as_float32(centers if offset is None else centers - offset),
         as_float32(raw_quats[rows] / norms[rows, None]),
         as_float32(scales),
         as_float32(opacities[rows].clip(0, 1)),
         as_float32(sh[rows]),
     )
     moving = None if motion is None else as_float32(motion[rows])
-    return Splats(gaussians.validate(), len(good) - count, antialiasing, as_float32(norms[rows]), motion=moving)
+    lengths = as_float32(norms[rows])
+    return Splats(gaussians.validate(), len(good) - count, antialiasing, lengths, offset=offset, motion=moving)
 
 
 def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:
