@@ -2,13 +2,17 @@
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from msdgs_serve.scene import MsdgsError
+from msdgs_train.datasets.common.fields import FieldTable
+
+MAX_NAMES = 12
+"""Fields that one warning names."""
 
 
 class DatasetInvalid(MsdgsError):
@@ -101,6 +105,16 @@ def read_table(file: Path, columns: int) -> np.ndarray:
     if table.dtype.kind not in "fiu" or table.shape[1:] != (columns,):
         raise DatasetInvalid(file, "file", f"must hold real numbers in shape M×{columns}")
     return finite_rows(file, "row {}", table)
+
+
+def unread_fields(file: Path, table: FieldTable, names: Iterable[str]) -> list[str]:
+    """A warning that names those fields of a file that are in no table; none if there are none."""
+    unlisted = table.unlisted(names)
+    if not unlisted:
+        return []
+    are = "is not a known field" if len(unlisted) == 1 else "are not known fields"
+    shown = ", ".join(f"`{name}`" for name in unlisted[:MAX_NAMES]) + ", …" * (len(unlisted) > MAX_NAMES)
+    return [f"{file}: {shown} {are} of {table.format}, and not read: check that nothing depends on it"]
 
 
 def finite_rows(file: Path, field: str, table: np.ndarray) -> np.ndarray:

@@ -1,0 +1,68 @@
+"""Intrinsics that don't fit their images, mostly those of images in another resolution."""
+
+import math
+from collections.abc import Sequence
+
+from msdgs_serve.scene import Camera
+from msdgs_train.datasets.common.images import ImageSize
+from msdgs_train.datasets.common.readers import JsonObject
+
+SAME = 0.1
+"""Relative difference below which both coordinates of a principal point state the same resolution."""
+
+OTHER = 1.4
+"""Factor from which this is another resolution than the image's, and not a principal point off its center."""
+
+MAX_ANGLE_ERROR = 0.02
+"""Relative difference of focal lengths, from which an angle contradicts them."""
+
+
+def other_resolution(cx: float, cy: float, image: ImageSize) -> ImageSize | None:
+    """The size of the images that have this principal point in their center, if it is another one of the same shape."""
+    across, down = 2 * cx / image.width, 2 * cy / image.height
+    if min(across, down) <= 0 or abs(across - down) > SAME * down or 1 / OTHER < across < OTHER:
+        return None
+    return ImageSize(round(across * image.width), round(down * image.height))
+
+
+def check_resolution(entry: JsonObject, cx: float, cy: float, image: ImageSize) -> None:
+    """Raise `DatasetInvalid` if an entry that states no size has the intrinsics of another one."""
+    stated = other_resolution(cx, cy, image)
+    if stated is not None:
+        problem = f"and cy are {cx:g} and {cy:g}, the center of images of {stated}, but this one is {image}: "
+        raise entry.invalid("cx", problem + "give w and h, the size that fl_x, fl_y, cx and cy are for")
+
+
+def contradiction(values: JsonObject, camera: Camera) -> str | None:
+    """A warning if `values` has a focal length and an angle that state different ones; the focal length is used."""
+    for axis, focal, length in (("x", camera.fx, camera.width), ("y", camera.fy, camera.height)):
+        fl, angle = f"fl_{axis}", f"camera_angle_{axis}"
+        if values.get(fl) is None or values.get(angle) is None:
+            continue
+        by_angle = 0.5 * length / math.tan(0.5 * values.number(angle))
+        if abs(by_angle - focal) > MAX_ANGLE_ERROR * focal:
+            got = math.degrees(2 * math.atan(0.5 * length / focal))
+            stated = math.degrees(values.number(angle))
+            problem = f"{values.file}: `{values.prefix}{fl}` makes a field of view of {got:.1f}°, `{angle}` states "
+            return problem + f"{stated:.1f}°; {fl} is used. Remove the wrong one, or give w and h, the size it is for"
+    return None
+
+
+def principal_point_warnings(cameras: Sequence[tuple[str, Camera]]) -> list[str]:
+    """A warning if principal points of cameras, given with the images' names, lie outside of their images."""
+    outside = [(name, c) for name, c in cameras if not (0 <= c.cx <= c.width and 0 <= c.cy <= c.height)]
+    if not outside:
+        return []
+    name, camera = outside[0]
+    size = ImageSize(camera.width, camera.height)
+    stated = other_resolution(camera.cx, camera.cy, size)
+    likely = (
+        f"they are probably those of images {stated.width / size.width:.3g} times as wide" if stated else "check it"
+    )
+    problem = (
+        f"the principal point of {len(outside)} of {len(cameras)} images lies outside of the image, first of {name}: "
+    )
+    problem += (
+        f"({camera.cx:.6g}, {camera.cy:.6g}) in {size}. Unless the images are cut from larger ones, the intrinsics "
+    )
+    return [problem + f"are wrong, and the model will be empty; {likely}"]

@@ -1,0 +1,41 @@
+"""Masks of images: pixels where the mask is black don't count, neither in the loss nor in evaluations.
+
+This is the convention of nerfstudio's `mask_path` and of COLMAP's masks. Transparent pixels of a mask are black. JPEG
+has noise around edges, so that values below the half are black there.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from msdgs_train.datasets.common.images import ImageSize, read_pixels, read_size
+from msdgs_train.datasets.common.readers import DatasetInvalid
+
+JPEG = (".jpg", ".jpeg")
+WHITE = 255
+
+
+def checked_mask(mask: Path, image: ImageSize, image_path: Path) -> Path:
+    """Return the path of a mask. Raises `DatasetInvalid` if its size isn't that of the image."""
+    size = read_size(mask)
+    if size != image:
+        raise DatasetInvalid(mask, "mask", f"is {size}, but the image {image_path} is {image}: both must be the same")
+    return mask
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read [H, W] bool, true where pixels count. Raises `DatasetInvalid`."""
+    pixels = read_pixels(path, "uint16")
+    darkest = (1 << 15) if path.suffix.lower() in JPEG else 1
+    color_channels = pixels.shape[2] - (pixels.shape[2] in (2, 4))
+    counts = (pixels[..., :color_channels] >= darkest).any(axis=2)
+    if color_channels < pixels.shape[2]:
+        counts &= pixels[..., -1] > 0
+    return counts
+
+
+def as_rgba(mask: np.ndarray) -> np.ndarray:
+    """An opaque image, `WHITE` where the mask is true, so that masks are resampled by the same code as images."""
+    rgba = np.full((*mask.shape, 4), WHITE, np.uint8)
+    rgba[~mask, :3] = 0
+    return rgba
