@@ -1,9 +1,11 @@
 """Images with cameras and times, read from published dataset layouts: one file per format."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from msdgs_train.datasets.colmap.loader import SPARSE, load_colmap
 from msdgs_train.datasets.common.images import composite
+from msdgs_train.datasets.common.intrinsics import principal_point_warnings
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame, SceneData
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
@@ -23,10 +25,11 @@ LAYOUTS = (
 """Name, marker file and reader of each layout; COLMAP is tried last, since other layouts contain its files too."""
 
 
-def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0) -> SceneData:
+def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0, masks: bool = True) -> SceneData:
     """Read the dataset in folder `path`, detecting its layout.
 
-    `size` is the width in pixels that images are reduced to, height in proportion; `llffhold` that of `DataConfig`.
+    `size` is the width in pixels that images are reduced to, height in proportion; `llffhold` and `masks` are those of
+    `DataConfig`.
     Times are in [0, 1]. Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid` naming file and field, and
     `InvalidInput` for an unusable `size` or `llffhold`.
     """
@@ -36,6 +39,8 @@ def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0) -> 
     for _, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
             scene = load(folder, size).in_unit_time()
+            scene = replace(scene, warnings=(*scene.warnings, *principal_point_warnings(scene)))
+            scene = scene if masks else scene.without_masks()
             return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
     raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

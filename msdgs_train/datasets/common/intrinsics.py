@@ -1,11 +1,11 @@
 """Intrinsics that don't fit their images, mostly those of images in another resolution."""
 
 import math
-from collections.abc import Sequence
 
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets.common.images import ImageSize
 from msdgs_train.datasets.common.readers import JsonObject
+from msdgs_train.datasets.common.scene_data import SceneData
 
 SAME = 0.1
 """Relative difference below which both coordinates of a principal point state the same resolution."""
@@ -48,21 +48,21 @@ def contradiction(values: JsonObject, camera: Camera) -> str | None:
     return None
 
 
-def principal_point_warnings(cameras: Sequence[tuple[str, Camera]]) -> list[str]:
-    """A warning if principal points of cameras, given with the images' names, lie outside of their images."""
-    outside = [(name, c) for name, c in cameras if not (0 <= c.cx <= c.width and 0 <= c.cy <= c.height)]
+def principal_point_warnings(scene: SceneData) -> tuple[str, ...]:
+    """A warning if principal points lie outside of their images, as those of another resolution do."""
+    frames = [frame for split in scene.splits.values() for frame in split]
+    outside = [frame for frame in frames if not _is_inside(frame.camera)]
     if not outside:
-        return []
-    name, camera = outside[0]
-    size = ImageSize(camera.width, camera.height)
-    stated = other_resolution(camera.cx, camera.cy, size)
-    likely = (
-        f"they are probably those of images {stated.width / size.width:.3g} times as wide" if stated else "check it"
-    )
-    problem = (
-        f"the principal point of {len(outside)} of {len(cameras)} images lies outside of the image, first of {name}: "
-    )
+        return ()
+    camera, size = outside[0].camera, ImageSize(outside[0].camera.width, outside[0].camera.height)
+    other = other_resolution(camera.cx, camera.cy, size)
+    likely = f"it is the center of images {other.width / size.width:.3g} times as wide" if other else "check cx and cy"
+    problem = f"the principal point of {len(outside)} of {len(frames)} images lies outside of them, first of "
     problem += (
-        f"({camera.cx:.6g}, {camera.cy:.6g}) in {size}. Unless the images are cut from larger ones, the intrinsics "
+        f"{outside[0].name}: ({camera.cx:.6g}, {camera.cy:.6g}) in {size}. Unless the images are cut from larger "
     )
-    return [problem + f"are wrong, and the model will be empty; {likely}"]
+    return (problem + f"ones, the intrinsics are wrong and the model will be empty: {likely}",)
+
+
+def _is_inside(camera: Camera) -> bool:
+    return 0 <= camera.cx <= camera.width and 0 <= camera.cy <= camera.height

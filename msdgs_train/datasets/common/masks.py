@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from msdgs_train.datasets.common.images import ImageSize, read_pixels, read_size
+from msdgs_train.datasets.common.paths import find_file, posix
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 JPEG = (".jpg", ".jpeg")
@@ -21,6 +22,15 @@ def checked_mask(mask: Path, image: ImageSize, image_path: Path) -> Path:
     if size != image:
         raise DatasetInvalid(mask, "mask", f"is {size}, but the image {image_path} is {image}: both must be the same")
     return mask
+
+
+def find_mask(folder: Path, image_name: str) -> Path | None:
+    """Find the mask of an image in a folder of masks: `a.jpg.png` as COLMAP names it, `a.jpg` or `a.png`."""
+    if not folder.is_dir():
+        return None
+    name = posix(image_name)
+    candidates = (f"{name}.png", str(name), str(name.with_suffix(".png")))
+    return next((found for each in candidates if (found := find_file(folder, each))), None)
 
 
 def read_mask(path: Path) -> np.ndarray:
