@@ -280,11 +280,13 @@ class PathCamera(BaseModel):
 class NerfstudioPath(BaseModel):
     """The contents of nerfstudio's camera_path.json; other keys are ignored."""
 
-    camera_path: Annotated[list[PathCamera], Field(min_length=1, max_length=MAX_TIMES)]
+    camera_path: Annotated[list[PathCamera], Field(max_length=MAX_TIMES)] = Field(description="one or more")
     camera_type: Literal["perspective"] = Field(default="perspective", description="no other can be drawn")
     render_width: Pixels | None = Field(default=None, description="pixels; required if the request has no size")
     render_height: Pixels | None = Field(default=None, description="pixels; see `render_width`")
     fps: FramesPerSecond | None = Field(default=None, description="frames per second")
+    seconds: Number | None = Field(default=None, description="duration, if there is no `fps`")
+    crop: Any = Field(default=None, description="must be null: scenes are drawn whole")
 
 
 class VideoRequest(Strict):

@@ -82,11 +82,11 @@ def _view(file: Path, row: int, name: str, files: list[Path], pose: np.ndarray, 
     """Read all frames of one camera, in the order of time."""
     first = files[0]
     if first.suffix.lower() == VIDEO:
-        count, *image = read_info(first)
-        camera = reduced(_camera(file, row, pose, ImageSize(*image)), size, first)
+        info = read_info(first)
+        camera = reduced(_camera(file, row, pose, ImageSize(info.width, info.height)), size, first)
         return [
-            VideoFrame(f"{name}_{i:06d}", camera, t, first / f"{i:06d}", video=first, index=i, count=count)
-            for i, t in enumerate(_times(count))
+            VideoFrame(f"{name}_{i:06d}", camera, t, first / f"{i:06d}", video=first, index=i, info=info)
+            for i, t in enumerate(_times(info.count))
         ]
     image = read_size(first)
     for path in files:
