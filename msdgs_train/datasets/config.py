@@ -17,6 +17,8 @@ class DataConfig(Checked):
     llffhold: int = 0
     """N: the first training image and every N-th after it are held out for testing, and those halfway between for
     validation, in place of the dataset's splits; if it names none, these are of all images. 0: the dataset's splits."""
+    masks: bool = True
+    """Whether pixels that a dataset's masks hide (black in the mask) are left out of the loss and of evaluations."""
     background: Literal["white", "black", "random"] = "white"
     """Color behind the scene; random: another one each step, white in evaluation."""
     scene_half_size: float | None = None
@@ -28,6 +30,7 @@ class DataConfig(Checked):
         )
         self.require_positive_or_none("scene_half_size")
         self.require(("llffhold",), "0, or an integer of 3 or more", lambda v: type(v) is int and (v == 0 or v > 2))
+        self.require(("masks",), "true or false", lambda v: type(v) is bool)
         self.require(("background",), f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
 
     @property

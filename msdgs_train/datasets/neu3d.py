@@ -16,6 +16,7 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.extent import scene_half_size
+from msdgs_train.datasets.common.fields import FieldTable
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
 from msdgs_train.datasets.common.ply_points import read_ply_points
 from msdgs_train.datasets.common.readers import DatasetInvalid, read_table
@@ -28,6 +29,15 @@ CAMERAS = "cam0*"
 
 POINTS_FILES = ("points3D_downsample*.ply", "points3d.ply", "points3D.ply")
 """The first that exists is read; of several downsampled ones the last by name, which is the smallest."""
+
+NEU3D_FIELDS = FieldTable(
+    "Neu3D",
+    {
+        **dict.fromkeys(("down", "right", "back", "position", "height", "width", "focal", "displaymatrix"), "applied"),
+        **dict.fromkeys(("near", "far"), "harmless"),
+    },
+)
+"""Columns of `poses_bounds.npy`, and what the videos' headers say of their frames."""
 
 VIDEO = ".mp4"
 CAMERA_NAME = re.compile(r"cam\d+")

@@ -102,7 +102,7 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         raise InvalidInput("run", "a new folder, or --resume to continue the run in it", f"{folder}, which holds a run")
     with contextlib.ExitStack() as on_error:
         lock = on_error.enter_context(_locked(folder)) if stored else None
-        trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold))
+        trainer = Trainer(config, load_scene(data, config.data.size, config.data.llffhold, config.data.masks))
         seconds = trainer.load_checkpoint(folder / CHECKPOINT) if stored else 0.0
         if stored:
             require_same_phase(Schedule.from_config(stored), Schedule.from_config(config), trainer.step_count)

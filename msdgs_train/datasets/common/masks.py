@@ -38,7 +38,7 @@ def read_mask(path: Path) -> np.ndarray:
     pixels = read_pixels(path, "uint16")
     darkest = (1 << 15) if path.suffix.lower() in JPEG else 1
     color_channels = pixels.shape[2] - (pixels.shape[2] in (2, 4))
-    counts = (pixels[..., :color_channels] >= darkest).any(axis=2)
+    counts = np.any(pixels[..., :color_channels] >= darkest, axis=2)
     if color_channels < pixels.shape[2]:
         counts &= pixels[..., -1] > 0
     return counts

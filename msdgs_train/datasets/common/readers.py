@@ -89,8 +89,10 @@ def read_json(file: Path) -> JsonObject:
     """Read the object in a JSON file. Raises `DatasetInvalid` if there is none."""
     try:
         content = json.loads(read_bytes(file))
-    except (ValueError, RecursionError) as error:
-        raise DatasetInvalid(file, "file", f"is not JSON: {error}") from None
+    except json.JSONDecodeError as error:
+        raise DatasetInvalid(file, "file", f"is not JSON: line {error.lineno}, column {error.colno}") from None
+    except (ValueError, RecursionError):
+        raise DatasetInvalid(file, "file", "is not JSON") from None
     if not isinstance(content, dict):
         raise DatasetInvalid(file, "file", "must hold a JSON object")
     return JsonObject(file, content)
@@ -100,10 +102,11 @@ def read_table(file: Path, columns: int) -> np.ndarray:
     """Read [M, columns] finite numbers from a `.npy` file; M may be 0. Raises `DatasetInvalid` naming file and row."""
     try:
         table = np.lib.format.read_array(io.BytesIO(read_bytes(file)), allow_pickle=False)
-    except ValueError as error:
-        raise DatasetInvalid(file, "file", f"is not a NumPy array: {error}") from None
+    except ValueError:
+        raise DatasetInvalid(file, "file", "is not a NumPy array of numbers, or is cut off") from None
     if table.dtype.kind not in "fiu" or table.shape[1:] != (columns,):
-        raise DatasetInvalid(file, "file", f"must hold real numbers in shape M×{columns}")
+        got = f"{table.dtype} in shape {'×'.join(map(str, table.shape))}"
+        raise DatasetInvalid(file, "file", f"must hold real numbers in shape M×{columns}, got {got}")
     return finite_rows(file, "row {}", table)
 
 
