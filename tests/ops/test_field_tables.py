@@ -5,10 +5,21 @@ from pathlib import Path
 
 import pytest
 
+from msdgs_serve import camera_path
+from msdgs_train.datasets.colmap.model import COLMAP_FIELDS
 from msdgs_train.datasets.common.fields import FieldTable
+from msdgs_train.datasets.common.transforms_fields import TRANSFORMS_FIELDS
+from msdgs_train.datasets.hypernerf import HYPERNERF_FIELDS
+from msdgs_train.datasets.neu3d import NEU3D_FIELDS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
-TABLES: tuple[FieldTable, ...] = ()
+TABLES: tuple[FieldTable, ...] = (
+    TRANSFORMS_FIELDS,
+    COLMAP_FIELDS,
+    HYPERNERF_FIELDS,
+    NEU3D_FIELDS,
+    FieldTable("Camera paths", camera_path.FIELDS),
+)
 
 
 def documented(section: str) -> dict[str, str]:

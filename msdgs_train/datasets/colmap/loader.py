@@ -93,7 +93,7 @@ def _mask_warnings(folder: Path, frames: list[Frame]) -> tuple[str, ...]:
     without = [frame for frame in frames if frame.mask_path is None]
     if not without or not folder.is_dir() or not any(folder.iterdir()):
         return ()
-    name = without[0].image_path.name
+    name = without[0].image_path.relative_to(folder.parent / IMAGES).as_posix()
     problem = (
         f"{folder}: {len(without)} of {len(frames)} images have no mask, so that all their pixels count, first {name}"
     )

@@ -25,7 +25,7 @@ NOT_MOVING = (
 )
 REFUSED = {
     "is_fisheye": UNDISTORT,
-    **dict.fromkeys(("k4", "k5", "k6", "s[1-4]", "skew", "b1", "b2", "distortion_params"), UNDISTORT),
+    **dict.fromkeys(("k4", "k5", "k6", "s1", "s2", "s3", "s4", "skew", "b1", "b2", "distortion_params"), UNDISTORT),
     **dict.fromkeys(("ftheta_*", "latlong", "equirectangular", "fisheye_crop_radius"), UNDISTORT),
     **dict.fromkeys(("ortho*", "is_ortho*"), "only perspective cameras can be read"),
     **dict.fromkeys(
