@@ -1,6 +1,7 @@
 """Intrinsics that don't fit their images, mostly those of images in another resolution."""
 
 import math
+from typing import Any
 
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets.common.images import ImageSize
@@ -39,13 +40,20 @@ def contradiction(values: JsonObject, camera: Camera) -> str | None:
         fl, angle = f"fl_{axis}", f"camera_angle_{axis}"
         if values.get(fl) is None or values.get(angle) is None:
             continue
-        by_angle = 0.5 * length / math.tan(0.5 * values.number(angle))
-        if abs(by_angle - focal) > MAX_ANGLE_ERROR * focal:
-            got = math.degrees(2 * math.atan(0.5 * length / focal))
-            stated = math.degrees(values.number(angle))
-            problem = f"{values.file}: `{values.prefix}{fl}` makes a field of view of {got:.1f}°, `{angle}` states "
-            return problem + f"{stated:.1f}°; {fl} is used. Remove the wrong one, or give w and h, the size it is for"
+        if not _is_field_of_view(values.get(angle), focal, length):
+            got = 2 * math.atan(0.5 * length / focal)
+            problem = (
+                f"{values.file}: `{values.prefix}{fl}` makes a field of view of {got:.4f} radians, `{angle}` states "
+            )
+            problem += f"{str(values.get(angle))[:20]}; {fl} is used. Remove the wrong one, or give w and h, the size "
+            return problem + "that it is for"
     return None
+
+
+def _is_field_of_view(angle: Any, focal: float, length: int) -> bool:
+    if type(angle) not in (int, float) or not 0 < angle < math.pi:
+        return False
+    return abs(0.5 * length / math.tan(0.5 * angle) - focal) <= MAX_ANGLE_ERROR * focal
 
 
 def principal_point_warnings(scene: SceneData) -> tuple[str, ...]:

@@ -1,7 +1,8 @@
 """Masks of images: pixels where the mask is black don't count, neither in the loss nor in evaluations.
 
 This is the convention of nerfstudio's `mask_path` and of COLMAP's masks. Transparent pixels of a mask are black. JPEG
-has noise around edges, so that values below the half are black there.
+has noise around edges, so that values below the half are black there. In instant-ngp's `dynamic_mask_NAME.png` beside
+an image, all but black pixels don't count.
 """
 
 from pathlib import Path
@@ -12,6 +13,7 @@ from msdgs_train.datasets.common.images import ImageSize, read_pixels, read_size
 from msdgs_train.datasets.common.paths import find_file, posix
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
+DYNAMIC = "dynamic_mask_"
 JPEG = (".jpg", ".jpeg")
 WHITE = 255
 
@@ -33,6 +35,12 @@ def find_mask(folder: Path, image_name: str) -> Path | None:
     return next((found for each in candidates if (found := find_file(folder, each))), None)
 
 
+def dynamic_mask(image_path: Path) -> Path | None:
+    """Find instant-ngp's mask of an image."""
+    path = image_path.with_name(f"{DYNAMIC}{image_path.stem}.png")
+    return path if path.is_file() else None
+
+
 def read_mask(path: Path) -> np.ndarray:
     """Read [H, W] bool, true where pixels count. Raises `DatasetInvalid`."""
     pixels = read_pixels(path, "uint16")
@@ -41,7 +49,7 @@ def read_mask(path: Path) -> np.ndarray:
     counts = np.any(pixels[..., :color_channels] >= darkest, axis=2)
     if color_channels < pixels.shape[2]:
         counts &= pixels[..., -1] > 0
-    return counts
+    return ~counts if path.name.startswith(DYNAMIC) else counts
 
 
 def as_rgba(mask: np.ndarray) -> np.ndarray:

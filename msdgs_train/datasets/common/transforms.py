@@ -16,7 +16,7 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
 from msdgs_train.datasets.common.intrinsics import check_resolution, contradiction
-from msdgs_train.datasets.common.masks import checked_mask
+from msdgs_train.datasets.common.masks import checked_mask, dynamic_mask
 from msdgs_train.datasets.common.paths import find_file, not_found, posix
 from msdgs_train.datasets.common.ply_points import read_ply_points
 from msdgs_train.datasets.common.readers import JsonObject, unread_fields
@@ -112,7 +112,8 @@ def _read_frame(entry: JsonObject, size: int | None) -> Frame:
     camera = reduced(_camera(entry, stored), size, image_path)
     t = entry.number("time") if "time" in entry.values else 0.0
     distortion = checked_distortion(distortion, camera, entry.file, f"{entry.prefix}k1")
-    mask = None if entry.get("mask_path") is None else checked_mask(_named_file(entry, "mask_path"), stored, image_path)
+    mask = dynamic_mask(image_path) if entry.get("mask_path") is None else _named_file(entry, "mask_path")
+    mask = None if mask is None else checked_mask(mask, stored, image_path)
     return Frame(image_path.stem, camera, t, image_path, distortion, mask)
 
 

@@ -255,6 +255,9 @@ CONTRADICTIONS: list[Callable[..., Path]] = [
     partial(write, fl_y=30.0, camera_angle_y=0.5),
     partial(write, frame={"fl_x": 60.0, "camera_angle_x": 1.0}),
     partial(write, fl_x=120.0, camera_angle_x=0.98, w=None, h=None),
+    partial(write, camera_angle_x=56.1),
+    partial(write, camera_angle_x=0),
+    partial(write, camera_angle_x="wide"),
 ]
 
 

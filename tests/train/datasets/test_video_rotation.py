@@ -15,7 +15,7 @@ from tests.train.datasets.layouts import SMALL, poses_bounds, write_video
 
 ONE = 1 << 16
 MATRIX = 44  # bytes from the name of the box `tkhd` (version 0) to its matrix, ISO/IEC 14496-12
-TURNS: dict[str, tuple[tuple[int, int, int, int], Callable[[np.ndarray], np.ndarray]]] = {
+TURNS: dict[str, tuple[tuple[float, ...], Callable[[np.ndarray], np.ndarray]]] = {
     "upright": ((1, 0, 0, 1), lambda image: image),
     "90° clockwise": ((0, 1, -1, 0), lambda image: np.rot90(image, -1)),
     "180°": ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from msdgs_train.cli import main as cli
 from msdgs_train.datasets import Frame, SceneData, load_scene
 from msdgs_train.datasets.common.images import read_rgba, write_png
 from msdgs_train.engine import schedule
@@ -19,7 +20,7 @@ from msdgs_train.evaluation.perceptual import PerceptualMetrics
 from msdgs_train.losses.photometric import photometric_loss, ssim
 from msdgs_train.systems.base import Target, ViewLoss
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import SIZE, small_config, splatting, trained, write_scene
+from tests.support.training_scene import FEW, SIZE, small_config, splatting, trained, write_scene
 
 STEPS = 12
 HIDDEN = np.zeros((SIZE, SIZE), bool)
@@ -178,3 +179,20 @@ def test_an_evaluation_leaves_masked_pixels_out(tmp_path: Path):
     assert (got.psnr, got.ssim) == image_metrics(rgb, target, MASK.numpy())
     assert got.lpips == float((known - target).abs().max())
     assert got.moving_psnr == masked_psnr(rgb, target, moving & MASK.numpy())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_curve")
+def test_a_run_and_its_evaluation_say_that_there_are_masks(tmp_path: Path):
+    data = str(masked_scene(tmp_path / "data", HIDDEN))
+    psnrs = []
+    for name, options in (("masked", []), ("whole", ["--no-masks"])):
+        run = tmp_path / name
+        assert cli.main(["fit", data, str(run), "--steps=8", *FEW, *options]) == 0
+        assert cli.main(["eval", str(run)]) == 0
+        table = (run / "eval" / "test.md").read_text()
+        assert ("masks: 1 of 1 images have one; scores are over the pixels that count" in table) == (name == "masked")
+        scored, logged = (json.loads((run / file).read_text()) for file in ("eval/test.json", "metrics.json"))
+        assert scored["models"]["last"]["mean"]["psnr"] == logged["splits"]["test"]["psnr"]
+        psnrs.append(logged["splits"]["test"]["psnr"])
+    assert psnrs[0] > psnrs[1]
