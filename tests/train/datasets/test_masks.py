@@ -194,3 +194,16 @@ def test_a_mask_is_undistorted_as_its_image_is(tmp_path: Path, name: str, size: 
     write_pixels(frame.image_path, mask)
     assert (frame.load_mask() == (frame.load_rgba()[..., 0] == 255)).all()
     assert frame.load_rgba()[..., 0].max() == 255
+
+
+@pytest.mark.parametrize("layout", ["transforms.json", "transforms_train.json"])
+def test_instant_ngps_masks_are_white_where_pixels_do_not_count(tmp_path: Path, layout: str):
+    folder = layouts.write_nerfstudio(tmp_path, SMALL, content=nerfstudio_json(2, SMALL))
+    (folder / "transforms.json").rename(folder / layout)
+    mask = flat(0, SMALL)
+    mask[3:9] = 255
+    write_pixels(folder / "images" / "dynamic_mask_f_01.png", mask)
+    frames = [frame for split in load_scene(folder).splits.values() for frame in split]
+    masks = {frame.image_path.name: frame.load_mask() for frame in frames}
+    assert masks["f_00.png"] is None
+    assert (masks["f_01.png"] == (mask[..., 0] == 0)).all()
