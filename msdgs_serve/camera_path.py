@@ -11,11 +11,27 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
+from msdgs_serve.scene.fields import FieldTable
 
 DEFAULT_FPS = 24.0
 MIN_FPS, MAX_FPS = 0.01, 240.0
 MAX_NUMBER = 1e9
 """Limit of all numbers in a path, within which single precision neither overflows nor underflows."""
+
+FIELDS = FieldTable(
+    "Camera paths",
+    {
+        **dict.fromkeys(("camera_path", "camera_to_world", "fov", "render_time", "scene"), "applied"),
+        **dict.fromkeys(("render_width", "render_height", "fps", "seconds"), "applied"),
+        **dict.fromkeys(("camera_type", "crop"), "refused"),
+        **dict.fromkeys(
+            ("keyframes", "default_fov", "default_transition_sec", "is_cycle", "smoothness_value"), "harmless"
+        ),
+        "aspect": "harmless",
+    },
+)
+"""What is done with each field of nerfstudio's files and their cameras. Its viewer makes `camera_path` of `keyframes`
+and the fields beside them, and its renderer doesn't read these either."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +40,7 @@ class CameraPath:
 
     frames: tuple[tuple[Camera, float], ...]  # camera and scene time
     fps: float
+    warnings: tuple[str, ...] = ()  # what a user should know about the file
 
     def __post_init__(self) -> None:
         if not self.frames:
@@ -66,12 +83,12 @@ def read_nerfstudio(
     A camera's time is its `render_time`, a fraction of the scene's time range; without one, times are evenly spaced
     over the path. `size` replaces the size in the file. Raises `InvalidInput` naming the key.
     """
-    cameras = document.get("camera_path")
-    if not isinstance(cameras, Sequence) or isinstance(cameras, str) or not cameras:
-        raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
+    cameras = _cameras(document)
     kind = document.get("camera_type", "perspective")
     if kind != "perspective":
         raise InvalidInput("camera_type", "perspective", kind if isinstance(kind, str) else type(kind).__name__)
+    if document.get("crop") is not None:
+        raise InvalidInput("crop", "left out: scenes are drawn whole. Switch the viewer's crop off", "a crop")
     width, height = size or (_integer(document, "render_width"), _integer(document, "render_height"))
     even = even_times(len(cameras), time_range)
     frames = []
@@ -89,7 +106,25 @@ def read_nerfstudio(
         except InvalidInput as error:
             raise error.renamed(error.field.replace("camera", name, 1)) from None
         frames.append((camera, _time(each, even[number], time_range, name)))
-    return CameraPath(tuple(frames), _fps(document))
+    return CameraPath(tuple(frames), _fps(document, len(frames)), _warnings(document, cameras))
+
+
+def _cameras(document: Mapping[str, Any]) -> Sequence[Any]:
+    cameras = document.get("camera_path")
+    if not isinstance(cameras, Sequence) or isinstance(cameras, str):
+        raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
+    if not cameras:
+        expected = (
+            "a list of one camera or more, which nerfstudio's viewer writes if its path has two keyframes or more"
+        )
+        raise InvalidInput("camera_path", expected, "an empty list")
+    return cameras
+
+
+def _warnings(document: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    unknown = FIELDS.unlisted(dict.fromkeys([*document, *(name for each in cameras for name in each)]))
+    shown = ", ".join(f"`{name}`" for name in unknown)
+    return (f"not read, as no known field of a camera path: {shown}",) if unknown else ()
 
 
 def read_path_file(path: Path, time_range: tuple[float, float], size: tuple[int, int] | None = None) -> CameraPath:
@@ -99,9 +134,7 @@ def read_path_file(path: Path, time_range: tuple[float, float], size: tuple[int,
 
 def read_scene_names(path: Path) -> list[str]:
     """Return the `scene` of each camera of a path in a JSON file. Raises `InvalidInput` naming the key."""
-    cameras = _document(path).get("camera_path")
-    if not isinstance(cameras, list) or not cameras:
-        raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
+    cameras = _cameras(_document(path))
     return [_scene_name(each, f"camera_path.{number}") for number, each in enumerate(cameras)]
 
 
@@ -114,9 +147,14 @@ def _scene_name(camera: Any, at: str) -> str:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InvalidInput("path", "a readable JSON file", f"{path}: {error}") from None
+        document = json.loads(path.read_bytes())
+    except OSError as error:
+        raise InvalidInput("path", "a readable JSON file", f"{path}: {error.strerror}") from None
+    except json.JSONDecodeError as error:
+        place = f"line {error.lineno}, column {error.colno}"
+        raise InvalidInput("path", "a JSON file", f"{path}, which is none from {place} on") from None
+    except (ValueError, RecursionError):
+        raise InvalidInput("path", "a JSON file", f"{path}, which is none") from None
     if not isinstance(document, dict):
         raise InvalidInput("path", "a JSON object in nerfstudio's format", f"{path}: {type(document).__name__}")
     return document
@@ -132,8 +170,16 @@ def _time(camera: Mapping[str, Any], even: float, time_range: tuple[float, float
     return float(min(first + fraction * (last - first), last))
 
 
-def _fps(document: Mapping[str, Any]) -> float:
-    return float(_numbers([document.get("fps", DEFAULT_FPS)], 1, "fps")[0])
+def _fps(document: Mapping[str, Any], count: int) -> float:
+    """The path's `fps`, or so many that its frames last its `seconds`."""
+    if document.get("fps") is not None:
+        return float(_numbers([document["fps"]], 1, "fps")[0])
+    if document.get("seconds") is None:
+        return DEFAULT_FPS
+    (seconds,) = _numbers([document["seconds"]], 1, "seconds")
+    if not count / MAX_FPS <= seconds <= count / MIN_FPS:
+        raise InvalidInput("seconds", f"in [{count / MAX_FPS:.4g}, {count / MIN_FPS:.4g}] for {count} cameras", seconds)
+    return float(count / seconds)
 
 
 def _integer(document: Mapping[str, Any], name: str) -> int:

@@ -152,6 +152,7 @@ def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
     scenes = [options.scene.parent / name for name in read_scene_names(options.scene)]
     ranges = {scene: _opened(scene, options).scene.metadata.time_range for scene in dict.fromkeys(scenes)}
     paths = {scene: read_path_file(options.scene, time_range, _size(options)) for scene, time_range in ranges.items()}
+    _print_warnings(options.scene, paths[scenes[0]])
     views = [View(scene, *paths[scene].frames[number]) for number, scene in enumerate(scenes)]
     return views, _fps(options, paths[scenes[0]].fps)
 
@@ -168,6 +169,7 @@ def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPat
     metadata, size = session.scene.metadata, _size(options)
     if options.path is not None:
         path = read_path_file(options.path, metadata.time_range, size)
+        _print_warnings(options.path, path)
         return CameraPath(path.frames, _fps(options, path.fps))
     if options.frames < 1:
         raise InvalidInput("--frames", "at least 1", options.frames)
@@ -177,6 +179,11 @@ def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPat
         view.target, view.distance, options.elevation, view.up, view.fov_y, size, options.frames, metadata.time_range
     )
     return CameraPath(tuple(frames), _fps(options, DEFAULT_FPS))
+
+
+def _print_warnings(file: Path, path: CameraPath) -> None:
+    for warning in path.warnings:
+        print(f"{PROGRAM}: warning: {file}: {warning}", file=sys.stderr)
 
 
 def _fps(options: argparse.Namespace, default: float) -> float:

@@ -26,17 +26,19 @@ class HeldOutImages:
         self.training: list[Camera] = [frame.camera for frame in data.splits["train"]]
         held_out = [frame for frame in data.splits["test"] or data.splits["val"] if t0 <= frame.t <= t1]
         chosen = np.linspace(0, len(held_out) - 1, min(MAX_IMAGES, len(held_out))).round().astype(int)
-        self._frames: list[tuple[Frame, np.ndarray]] = []
+        self._frames: list[tuple[Frame, np.ndarray, np.ndarray | None]] = []
         self._background = info.background
         on_image = begin(len(chosen))
         for i in chosen:
-            self._frames.append((held_out[i], composite(held_out[i].load_rgba(), info.background)))
+            frame = held_out[i]
+            self._frames.append((frame, composite(frame.load_rgba(), info.background), frame.load_mask()))
             on_image()
 
     def psnr(self, pose: Pose, options: RasterizerOptions) -> float | None:
-        """Mean PSNR in dB over the images, as papers report it; None if there are none."""
+        """Mean PSNR in dB over the images, of the pixels that count, as papers report it; None if there are none."""
         values = []
-        for frame, target in self._frames:
+        for frame, target, mask in self._frames:
+            shown = slice(None) if mask is None else mask
             rgb = render(pose(frame.t), frame.camera, self._background, options)
-            values.append(compare(rgb, target).psnr)
+            values.append(compare(rgb[shown], target[shown]).psnr)
         return float(np.mean(values)) if values else None

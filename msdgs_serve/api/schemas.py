@@ -4,6 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from msdgs_serve.api.camera_paths import MAX_TIMES, NerfstudioPath
 from msdgs_serve.api.numbers import (
     Color,
     Decibels,
@@ -28,14 +29,12 @@ from msdgs_serve.api.numbers import (
     Row,
     Samples,
     Steps,
-    Unit,
     Vector,
 )
 from msdgs_serve.imaging import Channel, ImageFormat
 from msdgs_serve.scene.camera import CameraModel
 from msdgs_serve.video import VideoFormat
 
-MAX_TIMES = 1000
 MAX_BATCH = 1000
 
 
@@ -265,26 +264,6 @@ class FilmFrame(Strict):
 
     camera: CameraSpec
     t: Number = Field(description="time, within the scene's `time_range`", examples=[0.5])
-
-
-class PathCamera(BaseModel):
-    """A camera of nerfstudio's camera_path.json, in OpenGL axes; other keys are ignored."""
-
-    camera_to_world: Annotated[list[Number], Field(min_length=16, max_length=16)] = Field(
-        description="4×4 by rows", examples=[[0, 0, 1, 4, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]]
-    )
-    fov: FieldOfView = Field(description="vertical, degrees")
-    render_time: Unit | None = Field(default=None, description="fraction of the time range; default: evenly spaced")
-
-
-class NerfstudioPath(BaseModel):
-    """The contents of nerfstudio's camera_path.json; other keys are ignored."""
-
-    camera_path: Annotated[list[PathCamera], Field(min_length=1, max_length=MAX_TIMES)]
-    camera_type: Literal["perspective"] = Field(default="perspective", description="no other can be drawn")
-    render_width: Pixels | None = Field(default=None, description="pixels; required if the request has no size")
-    render_height: Pixels | None = Field(default=None, description="pixels; see `render_width`")
-    fps: FramesPerSecond | None = Field(default=None, description="frames per second")
 
 
 class VideoRequest(Strict):

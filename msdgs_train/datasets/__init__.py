@@ -5,6 +5,7 @@ from pathlib import Path
 
 from msdgs_train.datasets.colmap.loader import SPARSE, load_colmap
 from msdgs_train.datasets.common.images import composite
+from msdgs_train.datasets.common.intrinsics import principal_point_warnings
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame, SceneData
 from msdgs_train.datasets.common.times import NAMES, timed
@@ -25,12 +26,14 @@ LAYOUTS = (
 """Name, marker file and reader of each layout; COLMAP is tried last, since other layouts contain its files too."""
 
 
-def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0, time_from: str | None = None) -> SceneData:
+def load_scene(
+    path: Path | str, size: int | None = None, llffhold: int = 0, time_from: str | None = None, masks: bool = True
+) -> SceneData:
     """Read the dataset in folder `path`, detecting its layout.
 
-    `size` is the width in pixels that images are reduced to, height in proportion; `llffhold` and `time_from` are
-    those of `DataConfig`. Times are in [0, 1]. Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid`
-    naming file and field, and `InvalidInput` for an unusable `size`, `llffhold` or `time_from`.
+    `size` is the width in pixels that images are reduced to, height in proportion; the others are those of
+    `DataConfig`. Times are in [0, 1]. Pixels are read later, by `Frame.load_rgba`. Raises `DatasetInvalid` naming file
+    and field, and `InvalidInput` for an unusable `size`, `llffhold` or `time_from`.
     """
     folder = Path(path)
     if not folder.is_dir():
@@ -40,6 +43,8 @@ def load_scene(path: Path | str, size: int | None = None, llffhold: int = 0, tim
             own = NAMES if load is load_colmap else None  # COLMAP stores no times
             read = replace(load(folder, size), layout=layout)
             scene = timed(read, folder, own if time_from is None else time_from).in_unit_time()
+            scene = replace(scene, warnings=(*scene.warnings, *principal_point_warnings(scene)))
+            scene = scene if masks else scene.without_masks()
             return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
     raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")

@@ -1,7 +1,8 @@
-"""A cache of decoded images."""
+"""A cache of decoded images and masks."""
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,10 +14,10 @@ MAX_BYTES = 2 << 30
 
 
 class ImageCache:
-    """Keeps decoded images as uint8 RGBA, up to `MAX_BYTES`."""
+    """Keeps decoded images as uint8 RGBA, and masks as bool, up to `MAX_BYTES`."""
 
     def __init__(self) -> None:
-        self._pixels: dict[tuple[Path, int], np.ndarray] = {}
+        self._pixels: dict[tuple[Path, int, bool], np.ndarray] = {}
         self._bytes = 0
 
     def image(self, frame: Frame, background: Tensor) -> Tensor:
@@ -32,12 +33,23 @@ class ImageCache:
         half = frame.halved()
         return self._kept(half, lambda: half.downscale(self.rgba(frame)))
 
-    def _kept(self, frame: Frame, read: Callable[[], np.ndarray]) -> np.ndarray:
-        key = (frame.image_path, frame.camera.width)
-        rgba = self._pixels.get(key)
-        if rgba is None:
-            rgba = read()
-            if self._bytes + rgba.nbytes <= MAX_BYTES:
-                self._pixels[key] = rgba
-                self._bytes += rgba.nbytes
-        return rgba
+    def mask(self, frame: Frame) -> np.ndarray | None:
+        """Return which pixels of the image count, [H, W] bool; None if all do."""
+        if frame.mask_path is None:
+            return None
+        return self._kept(frame, lambda: cast(np.ndarray, frame.load_mask()), is_mask=True)
+
+    def half_mask(self, frame: Frame) -> np.ndarray | None:
+        """Return the mask of `frame.halved()`, downscaled from that of the frame."""
+        mask, half = self.mask(frame), frame.halved()
+        return None if mask is None else self._kept(half, lambda: half.downscale_mask(mask), is_mask=True)
+
+    def _kept(self, frame: Frame, read: Callable[[], np.ndarray], *, is_mask: bool = False) -> np.ndarray:
+        key = (frame.image_path, frame.camera.width, is_mask)
+        pixels = self._pixels.get(key)
+        if pixels is None:
+            pixels = read()
+            if self._bytes + pixels.nbytes <= MAX_BYTES:
+                self._pixels[key] = pixels
+                self._bytes += pixels.nbytes
+        return pixels

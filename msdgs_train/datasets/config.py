@@ -22,6 +22,8 @@ class DataConfig(Checked):
     """Times of the images: `names` takes the number, date or clock in the files' names that varies with time; `index`
     their order; `none` is a scene that stands still; a regular expression has the time as its group, such as
     'frame_(\\d+)'. The dataset's own times if not given, `names` for COLMAP."""
+    masks: bool = True
+    """Whether pixels that a dataset's masks hide (black in the mask) are left out of the loss and of evaluations."""
     background: Literal["white", "black", "random"] = "white"
     """Color behind the scene; random: another one each step, white in evaluation."""
     scene_half_size: float | None = None
@@ -35,6 +37,7 @@ class DataConfig(Checked):
         self.require_positive_or_none("scene_half_size")
         self.require(("llffhold",), "0, or an integer of 3 or more", lambda v: type(v) is int and (v == 0 or v > 2))
         self.require(("time_from",), EXPECTED, is_time_from)
+        self.require(("masks",), "true or false", lambda v: type(v) is bool)
         self.require(("background",), f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
 
     @property

@@ -25,16 +25,29 @@ from pathlib import Path
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.fields import FieldTable
 from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import ImageSize, read_size
-from msdgs_train.datasets.common.readers import DatasetInvalid, JsonObject, read_json, read_table
+from msdgs_train.datasets.common.readers import DatasetInvalid, JsonObject, read_json, read_table, unread_fields
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, reduced
 
 DATASET_FILE = "dataset.json"
 FIELDS = {"camera.fx": "focal_length", "camera.fy": "pixel_aspect_ratio", "camera.width": "image_size"}
 """The value of a file that makes a field of its camera invalid; all other fields come from `orientation`."""
 
+HYPERNERF_FIELDS = FieldTable(
+    "HyperNeRF",
+    {
+        **dict.fromkeys(("train_ids", "val_ids", "time_id", "warp_id", "scale", "center"), "applied"),
+        **dict.fromkeys(
+            ("orientation", "position", "focal_length", "principal_point", "pixel_aspect_ratio"), "applied"
+        ),
+        **dict.fromkeys(("radial_distortion", "tangential_distortion", "tangential", "image_size"), "applied"),
+        "skew": "refused",
+        **dict.fromkeys(("near", "far", "count", "num_exemplars", "ids", "appearance_id", "camera_id"), "harmless"),
+    },
+)
 
 Transform = Callable[[np.ndarray], np.ndarray]
 """Maps positions in the files' world, [..., 3], to the scene's."""
@@ -49,21 +62,35 @@ def load_hypernerf(folder: Path, size: int | None = None) -> SceneData:
     ids = {"train": dataset.names("train_ids"), "val": [], "test": dataset.names("val_ids")}
     if not ids["train"]:
         raise dataset.invalid("train_ids", "must name one frame or more")
-    times = _read_times(folder / "metadata.json", [id_ for split in ids.values() for id_ in split])
-    to_scene = _read_transform(folder / "scene.json")
+    metadata, world = read_json(folder / "metadata.json"), read_json(folder / "scene.json")
+    times = _times(metadata, [id_ for split in ids.values() for id_ in split])
+    to_scene = _transform(world)
+    cameras = {id_: read_json(folder / "camera" / f"{id_}.json") for id_ in times}
     copies = _find_copy(folder / "rgb", ids["train"][0], size)
     splits = {
-        split: [_frame(folder, copies / f"{id_}.png", times[id_], to_scene, size) for id_ in members]
+        split: [_frame(cameras[id_], copies / f"{id_}.png", times[id_], to_scene, size) for id_ in members]
         for split, members in ids.items()
     }
     points = _read_points(folder / "points.npy", to_scene)
-    cameras = [frame.camera for frames in splits.values() for frame in frames]
-    return SceneData(splits, scene_half_size(points, cameras), points)
+    half_size = scene_half_size(points, [frame.camera for frames in splits.values() for frame in frames])
+    groups = {
+        folder / DATASET_FILE: [dataset],
+        metadata.file: [metadata.child(id_) for id_ in times],
+        world.file: [world],
+        folder / "camera": list(cameras.values()),
+    }
+    warnings = [text for place, objects in groups.items() for text in _unread(place, objects)]
+    return SceneData(splits, half_size, points, warnings=tuple(warnings))
 
 
-def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
-    """Read times in [0, 1]; all are 0 if the largest time_id is 0."""
-    metadata, numbers = read_json(file), {}
+def _unread(place: Path, objects: list[JsonObject]) -> list[str]:
+    names = dict.fromkeys(name for each in objects for name in each.values)
+    return unread_fields(place, HYPERNERF_FIELDS, names)
+
+
+def _times(metadata: JsonObject, ids: list[str]) -> dict[str, float]:
+    """Times in [0, 1] by id; all are 0 if the largest time_id is 0."""
+    numbers = {}
     for id_ in ids:
         entry = metadata.child(id_)
         key = "time_id" if "time_id" in entry.values else "warp_id"
@@ -76,8 +103,7 @@ def _read_times(file: Path, ids: list[str]) -> dict[str, float]:
     return {id_: number / last for id_, number in numbers.items()}
 
 
-def _read_transform(file: Path) -> Transform:
-    scene = read_json(file)
+def _transform(scene: JsonObject) -> Transform:
     scale = scene.number("scale")
     if scale <= 0:
         raise scene.invalid("scale", f"must be above 0, got {scale:g}")
@@ -97,13 +123,11 @@ def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
     return wide_enough[-1] if wide_enough else copies[0]
 
 
-def _frame(folder: Path, image_path: Path, t: float, to_scene: Transform, size: int | None) -> Frame:
-    file = folder / "camera" / f"{image_path.stem}.json"
-    values = read_json(file)
+def _frame(values: JsonObject, image_path: Path, t: float, to_scene: Transform, size: int | None) -> Frame:
     camera = _camera(values, to_scene, read_size(image_path))
     k1, k2, k3 = values.numbers("radial_distortion", 3).tolist()
     p1, p2 = values.numbers("tangential" if "tangential" in values.values else "tangential_distortion", 2).tolist()
-    distortion = checked_distortion(Distortion(k1, k2, p1, p2, k3), camera, file, "radial_distortion")
+    distortion = checked_distortion(Distortion(k1, k2, p1, p2, k3), camera, values.file, "radial_distortion")
     return Frame(image_path.stem, reduced(camera, size, image_path), t, image_path, distortion)
 
 

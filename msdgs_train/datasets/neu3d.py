@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene.fields import FieldTable
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
 from msdgs_train.datasets.common.name_fields import natural_order
@@ -29,6 +30,15 @@ CAMERAS = "cam0*"
 
 POINTS_FILES = ("points3D_downsample*.ply", "points3d.ply", "points3D.ply")
 """The first that exists is read; of several downsampled ones the last by name, which is the smallest."""
+
+NEU3D_FIELDS = FieldTable(
+    "Neu3D",
+    {
+        **dict.fromkeys(("down", "right", "back", "position", "height", "width", "focal", "displaymatrix"), "applied"),
+        **dict.fromkeys(("near", "far"), "harmless"),
+    },
+)
+"""Columns of `poses_bounds.npy`, and what the videos' headers say of their frames."""
 
 VIDEO = ".mp4"
 CAMERA_NAME = re.compile(r"cam\d+")
@@ -78,11 +88,11 @@ def _view(file: Path, row: int, name: str, files: list[Path], pose: np.ndarray, 
     """Read all frames of one camera, in the order of time."""
     first = files[0]
     if first.suffix.lower() == VIDEO:
-        count, *image = read_info(first)
-        camera = reduced(_camera(file, row, pose, ImageSize(*image)), size, first)
+        info = read_info(first)
+        camera = reduced(_camera(file, row, pose, ImageSize(info.width, info.height)), size, first)
         return [
-            VideoFrame(f"{name}_{i:06d}", camera, t, first / f"{i:06d}", video=first, index=i, count=count)
-            for i, t in enumerate(_times(count))
+            VideoFrame(f"{name}_{i:06d}", camera, t, first / f"{i:06d}", video=first, index=i, info=info)
+            for i, t in enumerate(_times(info.count))
         ]
     image = read_size(first)
     for path in files:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from msdgs_train.datasets import Frame
 from msdgs_train.layers.parameters import ParamGroup
-from msdgs_train.systems.base import ViewLoss
+from msdgs_train.systems.base import Target, ViewLoss
 
 
 class ViewGradients(NamedTuple):
@@ -17,17 +17,16 @@ class ViewGradients(NamedTuple):
     frame: Frame
     view: ViewLoss
     loss: float
-    squared_error: float  # mean over pixels and channels
+    squared_error: float  # mean over channels and the pixels that count
     gradients: dict[int, Tensor]  # by id of the parameter; those that the loss depends on
 
 
-def differentiate(groups: Sequence[ParamGroup], frame: Frame, view: ViewLoss, target: Tensor) -> ViewGradients:
+def differentiate(groups: Sequence[ParamGroup], frame: Frame, view: ViewLoss, target: Target) -> ViewGradients:
     """The gradients of the parameters that the loss depends on."""
     parameters = [p for group in groups for p in group.params]
     found = torch.autograd.grad(view.loss, parameters, allow_unused=True)
     gradients = {id(p): gradient for p, gradient in zip(parameters, found, strict=True) if gradient is not None}
-    squared_error = float((view.rgb.detach() - target).square().mean())
-    return ViewGradients(frame, view, view.loss.item(), squared_error, gradients)
+    return ViewGradients(frame, view, view.loss.item(), target.squared_error(view.rgb), gradients)
 
 
 def average_gradients(groups: Sequence[ParamGroup], views: Sequence[ViewGradients]) -> None:

@@ -102,7 +102,8 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         raise InvalidInput("run", "a new folder, or --resume to continue the run in it", f"{folder}, which holds a run")
     with contextlib.ExitStack() as on_error:
         lock = on_error.enter_context(_locked(folder)) if stored else None
-        scene = load_scene(data, config.data.size, config.data.llffhold, config.data.time_from)
+        d = config.data
+        scene = load_scene(data, d.size, d.llffhold, d.time_from, d.masks)
         record = read_record(folder) if stored else None
         scene = scene.normalized() if record is None else scene.in_frame(record.scene_to_world)
         trainer = Trainer(config, scene)

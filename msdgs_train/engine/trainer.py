@@ -116,7 +116,7 @@ class Trainer:
         for frame in self.scene.splits[split]:
             target = self._images.image(frame, background)
             rgb = self.system.render(frame.camera, frame.t, on_device, self.step_count).cpu()
-            yield EvaluatedFrame(frame, target, rgb, image_metrics(rgb, target))
+            yield EvaluatedFrame(frame, target, rgb, image_metrics(rgb, target, self._images.mask(frame)))
 
     def save_checkpoint(self, path: Path, seconds: float) -> None:
         """Write the complete state, from which training continues bit by bit; `seconds` of training so far. Atomic."""
@@ -207,12 +207,12 @@ class Trainer:
     @sharing_cores()
     def _differentiate(self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor) -> ViewGradients:
         if self.schedule.halves(frame.camera.width, self.step_count):
-            rgba, frame = self._images.half_rgba(frame), frame.halved()
+            rgba, mask, frame = self._images.half_rgba(frame), self._images.half_mask(frame), frame.halved()
         else:
-            rgba = self._images.rgba(frame)
-        target = Target.over(rgba, background, self.config.run.device)
+            rgba, mask = self._images.rgba(frame), self._images.mask(frame)
+        target = Target.over(rgba, background, self.config.run.device, mask)
         view = self.system.loss(frame, target, background.to(target.rgb.device), self.step_count)
-        return differentiate(groups, frame, view, target.rgb)
+        return differentiate(groups, frame, view, target)
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":

@@ -15,6 +15,7 @@ from msdgs_train.evaluation.metrics import image_metrics, masked_psnr
 from msdgs_train.evaluation.moving_region import moving_region
 from msdgs_train.evaluation.perceptual import PerceptualMetrics, perceptual_metrics
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
+from msdgs_train.losses.photometric import filled
 
 FILES = {"last": MODEL, "best": BEST}
 
@@ -83,7 +84,7 @@ def evaluate_run(
     names = [name for name, file in FILES.items() if name == "last" or (not brief and (run / file).exists())]
     loaded = {name: load_model(run / FILES[name]) for name in names}
     data = _data_folder(run, data)
-    scene = load_scene(data, settings.size, settings.llffhold, settings.time_from)
+    scene = load_scene(data, settings.size, settings.llffhold, settings.time_from, settings.masks)
     scene = scene.in_frame(loaded["last"].scene.placement)
     frames = _frames(scene, data, split)
     region = moving_region(scene, split, list(loaded.values()))
@@ -93,7 +94,8 @@ def evaluate_run(
     for index, frame in enumerate(frames):
         masks.append(region.mask(frame))
         for place, evaluated in enumerate(models):
-            evaluated.images.append(scores(evaluated.render(frame), evaluated.image(frame), masks[-1], perceptual))
+            rgb, target = evaluated.render(frame), evaluated.image(frame)
+            evaluated.images.append(scores(rgb, target, masks[-1], perceptual, frame.load_mask()))
             if progress is not None:
                 progress(index * len(models) + place + 1, len(frames) * len(models))
     record = read_record(run)
@@ -101,11 +103,23 @@ def evaluate_run(
     return Evaluation(data, split, frames, models, best, region.source, masks, perceptual.unavailable)
 
 
-def scores(rgb: Tensor, target: Tensor, mask: np.ndarray, perceptual: PerceptualMetrics) -> Scores:
-    """Score a rendering against its image, [H, W, 3] in [0, 1]; `mask`, [H, W] bool, is the moving region."""
-    psnr, ssim = image_metrics(rgb, target)
+def scores(
+    rgb: Tensor,
+    target: Tensor,
+    moving: np.ndarray,
+    perceptual: PerceptualMetrics,
+    counts: np.ndarray | None = None,
+) -> Scores:
+    """Score a rendering against its image, [H, W, 3] in [0, 1], by the pixels that count, [H, W] bool; None: all.
+
+    `moving`, [H, W] bool, is the moving region. LPIPS and ꟻLIP are means over all pixels, with no error in those that
+    don't count.
+    """
+    psnr, ssim = image_metrics(rgb, target, counts)
+    if counts is not None:
+        rgb, moving = filled(rgb, target, torch.from_numpy(counts)), moving & counts
     others = {name: metric(rgb, target) for name, metric in perceptual.metrics.items()}
-    return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, mask))
+    return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, moving))
 
 
 def _data_folder(run: Path, data: Path | None) -> Path:

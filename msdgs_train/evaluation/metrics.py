@@ -21,7 +21,7 @@ class ImageMetrics(NamedTuple):
 
 
 def psnr(rgb: Tensor, target: Tensor) -> float:
-    """Return PSNR in dB of [H, W, 3] images with values in [0, 1], over all pixels and channels."""
+    """Return PSNR in dB of […, 3] pixels with values in [0, 1], over all pixels and channels."""
     return psnr_from_mse(float((rgb - target).double().square().mean()))
 
 
@@ -36,10 +36,14 @@ def psnr_from_mse(mse: float) -> float:
     return MAX_PSNR if mse <= 10 ** (-MAX_PSNR / 10) else -10 * math.log10(mse)
 
 
-def image_metrics(rgb: Tensor, target: Tensor) -> ImageMetrics:
-    """Return PSNR and SSIM of one rendering, clamped to [0, 1] first; both [H, W, 3]."""
+def image_metrics(rgb: Tensor, target: Tensor, mask: np.ndarray | None = None) -> ImageMetrics:
+    """Return PSNR and SSIM of one rendering, clamped to [0, 1] first; both [H, W, 3]. Both are means over the pixels of
+    `mask`, [H, W] bool; None: over all."""
     shown = rgb.detach().clamp(0, 1)
-    return ImageMetrics(psnr(shown, target), float(ssim(shown, target)))
+    if mask is None:
+        return ImageMetrics(psnr(shown, target), float(ssim(shown, target)))
+    counts = torch.from_numpy(mask)
+    return ImageMetrics(psnr(shown[counts], target[counts]), float(ssim(shown, target, counts)))
 
 
 def mean_metrics(metrics: list[ImageMetrics]) -> ImageMetrics:

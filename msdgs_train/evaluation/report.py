@@ -100,6 +100,10 @@ def notes(evaluation: Evaluation) -> list[str]:
         lines.append(f"best: highest PSNR on `{best.split}` during training, {best.psnr:.2f} dB.")
     elif len(evaluation.models) < len(FILES):
         lines.append(f"best: this run has no {FILES['best']}.")
+    masked = sum(frame.mask_path is not None for frame in evaluation.frames)
+    if masked:
+        line = f"masks: {masked} of {len(evaluation.frames)} images have one; scores are over the pixels that count, "
+        lines.append(line + "LPIPS and ꟻLIP over all, without an error in the others.")
     return [*lines, *(f"{HEADINGS[name][:-2]}: unavailable, {why}." for name, why in evaluation.unavailable.items())]
 
 
@@ -136,7 +140,7 @@ def _evenly_spaced(count: int) -> list[int]:
 def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int, errors: bool = True) -> list[Panel]:
     """Return panels of the image of a frame and its rendering by each model, each with its error if `errors`."""
     frame, mask = evaluation.frames[index], evaluation.masks[index]
-    target = models[0].image(frame).numpy()
+    target, counts = models[0].image(frame).numpy(), frame.load_mask()
     row = [_panel(to_bytes(target), f"{frame.name}, t = {frame.t:.3g}")]
     for evaluated in models:
         scores, rgb = evaluated.images[index], evaluated.render(frame).numpy()
@@ -144,6 +148,7 @@ def _row(evaluation: Evaluation, models: list[EvaluatedModel], index: int, error
         row.append(_panel(to_bytes(rgb), f"{evaluated.name}: {scores.psnr:.1f} dB{moving}"))
         if errors:
             relative = np.abs(rgb - target).mean(axis=-1) / FULL_ERROR
+            relative = relative if counts is None else relative * counts
             error = colormaps["magma"](np.clip(relative, 0, 1), bytes=True)[..., :3]
             error[_outline(mask)] = OUTLINE
             row.append(_panel(error, "error" + (", moving region outlined" if mask.any() else "")))

@@ -16,7 +16,9 @@ MSE_SCALE = 4.0
 """Factor of MSE, at which it equals L1 for an error of 0.25."""
 
 
-def photometric_loss(rgb: Tensor, target: Tensor, l1_weight: float, mse_fraction: float = 0.0) -> Tensor:
+def photometric_loss(
+    rgb: Tensor, target: Tensor, l1_weight: float, mse_fraction: float = 0.0, mask: Tensor | None = None
+) -> Tensor:
     """λ L1 + (1 − λ)(1 − SSIM), a scalar (equation 13), of which a fraction may be MSE instead.
 
     Args:
@@ -24,19 +26,34 @@ def photometric_loss(rgb: Tensor, target: Tensor, l1_weight: float, mse_fraction
         target: [H, W, 3] the image, same dtype, values in [0, 1].
         l1_weight: λ; the field uses 0.8.
         mse_fraction: fraction of MSE; 0 is equation 13, 1 is `MSE_SCALE` times the mean squared error.
+        mask: [H, W] bool, true where pixels count; None: all do. The loss is the mean over those, and the rendering's
+            others are replaced by the image's, as `filled` does.
     """
     check_pair(rgb, target)
     rest = 1 - mse_fraction
-    return _Photometric.apply(rgb, target, rest * l1_weight, mse_fraction * MSE_SCALE, rest * (1 - l1_weight))
+    weights = rest * l1_weight, mse_fraction * MSE_SCALE, rest * (1 - l1_weight)
+    if mask is None:
+        return _Photometric.apply(rgb, target, *weights)
+    return _Photometric.apply(filled(rgb, target, mask), target, *weights) * share_factor(mask)
 
 
-def ssim(rgb: Tensor, target: Tensor) -> Tensor:
-    """Return the mean structural similarity, a scalar, differentiable in `rgb`.
+def ssim(rgb: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return the mean structural similarity over the pixels of `mask`, a scalar, differentiable in `rgb`.
 
     Window 11, σ = 1.5, data range 1, and zeros beyond the border, as the 3D Gaussian projects compute it.
     """
-    check_pair(rgb, target)
-    return 1 - _Photometric.apply(rgb, target, 0.0, 0.0, 1.0)
+    return 1 - photometric_loss(rgb, target, 0.0, 0.0, mask)
+
+
+def filled(rgb: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """The rendering, [H, W, 3], with the image's own pixels outside of `mask`, where it then has neither error nor
+    gradient. Windows of SSIM across the mask's border see the image there."""
+    return torch.where(mask[..., None], rgb, target)
+
+
+def share_factor(mask: Tensor) -> float:
+    """What turns a mean over all pixels, with no error outside of `mask`, into the mean over the pixels of the mask."""
+    return mask.numel() / max(int(mask.sum()), 1)
 
 
 def check_pair(rgb: Tensor, target: Tensor) -> None:

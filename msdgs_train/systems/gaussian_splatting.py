@@ -95,7 +95,7 @@ class GaussianSplatting:
         motions, c = self._motions(frame.t, step), self.config.loss
         posed = self._pose(self.model, frame.t, step, motions)
         rgb, alpha, info = rasterize(*posed, frame.camera, background, self._options(step + 1))
-        loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction)
+        loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction, target.mask)
         loss = loss + self._regularizers(posed, motions, frame.t, step)
         if c.alpha_weight:
             loss = loss + c.alpha_weight * target.alpha_error(alpha)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ import PIL.ImageSequence
 import pytest
 from av.video.reformatter import ColorRange
 
-from msdgs_serve import blocks, render_cli
-from msdgs_serve.camera_path import read_nerfstudio
+from msdgs_serve import blocks, camera_path, render_cli
+from msdgs_serve.camera_path import CameraPath, read_nerfstudio
 from msdgs_serve.imaging import Image, encode
 from msdgs_serve.render_cli import INTERRUPTED, main
 from msdgs_serve.scene import InvalidInput
@@ -71,10 +72,90 @@ def test_nerfstudios_path_is_read():
     assert read_nerfstudio(document, (0.0, 2.0), (32, 16)).frames[0][0].height == 16
 
 
+KEYFRAME = {"matrix": "[1]", "fov": 50, "aspect": 1.5, "override_transition_enabled": False}
+HARMLESS = {"keyframes": [KEYFRAME], "default_fov": 75, "default_transition_sec": 2.0, "is_cycle": True, "aspect": 1.5}
+HARMLESS |= {"smoothness_value": 0.5}
+CAMERA = nerfstudio()["camera_path"][0]
+APPLIED = {
+    "camera_path": {"camera_path": [CAMERA] * 4},
+    "camera_to_world": {"camera_path": [{**CAMERA, "camera_to_world": np.eye(4).ravel().tolist()}] * 3},
+    "fov": {"camera_path": [{**CAMERA, "fov": 50}] * 3},
+    "render_time": {"camera_path": [{**CAMERA, "render_time": 0.3}] * 3},
+    "render_width": {"render_width": 32},
+    "render_height": {"render_height": 32},
+    "fps": {"fps": 5},
+    "seconds": {"fps": None, "seconds": 1.5},
+}
+CROP = {"crop_center": [0, 0, 0], "crop_scale": [1, 1, 1], "crop_bg_color": {"r": 1, "g": 2, "b": 3}}
+
+
+def shown(path: CameraPath) -> str:
+    return repr([(camera, camera.camera_to_world.tolist(), t, path.fps) for camera, t in path.frames])
+
+
+def test_fields_that_made_the_path_have_no_effect():
+    plain = read_nerfstudio(nerfstudio(), (0.0, 1.0))
+    path = read_nerfstudio(nerfstudio(**HARMLESS, crop=None), (0.0, 1.0))
+    assert (shown(path), path.warnings) == (shown(plain), ())
+
+
+@pytest.mark.parametrize("name", APPLIED)
+def test_an_applied_field_of_a_path_has_an_effect(name: str):
+    plain, path = (read_nerfstudio(nerfstudio(**changes), (0.0, 1.0)) for changes in ({}, APPLIED[name]))
+    assert shown(path) != shown(plain)
+
+
+def test_each_field_of_a_path_has_an_example():
+    """Scenes of cameras are read by `msdgs-render`."""
+    uses = {**dict.fromkeys(APPLIED, "applied"), **dict.fromkeys(HARMLESS, "harmless")}
+    assert {**uses, "scene": "applied", "crop": "refused", "camera_type": "refused"} == camera_path.FIELDS.uses
+
+
+def test_seconds_make_the_frame_rate_of_a_path_without_one():
+    document = nerfstudio(6, fps=None, seconds=1.5)
+    assert read_nerfstudio(document, (0.0, 1.0)).fps == 4.0
+    del document["fps"]
+    assert read_nerfstudio(document, (0.0, 1.0)).fps == 4.0
+    assert read_nerfstudio(nerfstudio(6, fps=12, seconds=1.5), (0.0, 1.0)).fps == 12
+    assert read_nerfstudio(nerfstudio(6, fps=None, seconds=None), (0.0, 1.0)).fps == 24
+
+
+def test_unknown_fields_of_a_path_are_named_once(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    document = nerfstudio(haze=1)
+    for camera in document["camera_path"]:
+        camera["shutter"] = 0.5
+    assert read_nerfstudio(document, (0.0, 1.0)).warnings == (
+        "not read, as no known field of a camera path: `haze`, `shutter`",
+    )
+    (tmp_path / "path.json").write_text("\ufeff" + json.dumps(document), encoding="utf-8")
+    assert main([str(scene), str(tmp_path / "out"), "--path", str(tmp_path / "path.json")]) == 0
+    assert f"msdgs-render: warning: {tmp_path / 'path.json'}: not read, as" in capsys.readouterr().err
+
+
+def test_a_path_without_cameras_says_what_is_missing(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for text, message in (
+        (
+            json.dumps(nerfstudio(camera_path=[])),
+            "one camera or more, which nerfstudio's viewer writes if its path",
+        ),
+        ("{", "must be a JSON file, got .*, which is none from line 1, column 2 on"),
+        ("\x00", "must be a JSON file, got "),
+    ):
+        (tmp_path / "path.json").write_text(text)
+        assert main([str(scene), str(tmp_path / "out"), "--path", str(tmp_path / "path.json")]) == 2
+        assert re.search(message, capsys.readouterr().err)
+
+
 @pytest.mark.parametrize(
     ("changes", "field"),
     [
         ({"camera_path": []}, "camera_path"),
+        ({"crop": CROP}, "crop"),
+        ({"crop": False}, "crop"),
+        ({"fps": None, "seconds": 0}, "seconds"),
+        ({"fps": None, "seconds": -1}, "seconds"),
+        ({"fps": None, "seconds": "1"}, "seconds"),
+        ({"camera_type": "fisheye"}, "camera_type"),
         ({"camera_path": "x"}, "camera_path"),
         ({"camera_path": [1]}, "camera_path.0"),
         ({"camera_path": [{"camera_to_world": [1] * 15, "fov": 40}]}, "camera_path.0.camera_to_world"),

@@ -6,10 +6,26 @@ from pathlib import Path
 import pytest
 
 from export.importers.splats import ksplat, ply_fields, sog, splat, spz_container
+from msdgs_serve import camera_path
 from msdgs_serve.scene.fields import FieldTable
+from msdgs_train.datasets.colmap.model import COLMAP_FIELDS
+from msdgs_train.datasets.common.transforms_fields import TRANSFORMS_FIELDS
+from msdgs_train.datasets.hypernerf import HYPERNERF_FIELDS
+from msdgs_train.datasets.neu3d import NEU3D_FIELDS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
-TABLES: tuple[FieldTable, ...] = (ply_fields.PLY, spz_container.FIELDS, sog.FIELDS, ksplat.FIELDS, splat.FIELDS)
+TABLES: tuple[FieldTable, ...] = (
+    ply_fields.PLY,
+    spz_container.FIELDS,
+    sog.FIELDS,
+    ksplat.FIELDS,
+    splat.FIELDS,
+    TRANSFORMS_FIELDS,
+    COLMAP_FIELDS,
+    HYPERNERF_FIELDS,
+    NEU3D_FIELDS,
+    camera_path.FIELDS,
+)
 
 
 def documented(section: str) -> dict[str, str]:

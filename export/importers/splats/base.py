@@ -43,9 +43,8 @@ class Splats:
     def around(self, origin: np.ndarray) -> Gaussians:
         """The Gaussians with centers relative to a point of the file's world, [3]."""
         moved = (np.zeros(3) if self.offset is None else self.offset) - origin
-        return (
-            replace(self.gaussians, means=as_float32(self.gaussians.means + moved)) if moved.any() else self.gaussians
-        )
+        g = self.gaussians
+        return replace(g, means=as_float32(g.means + moved)) if moved.any() else g
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """The fields by name, for `from_arrays`."""
@@ -76,7 +75,8 @@ def splats(
     [0, 1] and sh [N, C, 3]; `motion`, [N, 15], is kept as it is.
 
     Rows with NaN, infinity, values beyond the limits above or a quaternion of norm under 1e-8 are dropped and counted;
-    log-scales are clamped to ±20. Means far from the origin are moved to it: `Splats.offset`. Raises `ImportFailed` if no row is left.
+    log-scales are clamped to ±20. Means far from the origin are moved to it: `Splats.offset`. Raises `ImportFailed` if
+    no row is left.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         norms = np.linalg.norm(raw_quats.astype(np.float64), axis=1)

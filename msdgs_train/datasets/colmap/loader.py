@@ -2,14 +2,15 @@
 
 Poses map world to camera in OpenCV axes and pixel centers are at half-integers, both as in `Camera`. Images of
 the models SIMPLE_RADIAL, RADIAL and OPENCV are undistorted by `Frame.load_rgba`, bilinearly, to a pinhole camera with
-the same intrinsics. If `images` holds downscaled copies, intrinsics are scaled to them.
+the same intrinsics. If `images` holds downscaled copies, intrinsics are scaled to them. `masks/a.png.png`, as COLMAP
+names them, or `masks/a.png` is the mask of `images/a.png`, black where pixels don't count.
 
 COLMAP stores no times: `load_scene` takes them from the images' names, and t = 0 here. The first image, in the order of
 names, and every 8th after it are test frames.
 """
 
 import math
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
@@ -21,10 +22,12 @@ from msdgs_train.datasets.colmap.model import ModelCamera, ModelImage
 from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import ImageSize, read_size
+from msdgs_train.datasets.common.masks import checked_mask, find_mask
+from msdgs_train.datasets.common.paths import find_file, not_found, posix
 from msdgs_train.datasets.common.readers import DatasetInvalid, finite_rows
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, hold_out, reduced
 
-SPARSE = "sparse"
+SPARSE, IMAGES, MASKS = "sparse", "images", "masks"
 
 
 def load_colmap(folder: Path, size: int | None = None) -> SceneData:
@@ -38,7 +41,8 @@ def load_colmap(folder: Path, size: int | None = None) -> SceneData:
     frames = [_frame(folder, files, image, cameras.get(image.camera_id), size) for image in images]
     points, colors = _points(files[2], list(read.read_points(files[2])))
     half_size = scene_half_size(points, [frame.camera for frame in frames])
-    return SceneData(hold_out(frames), half_size, points, colors, unsplit=frames)
+    warnings = _mask_warnings(folder / MASKS, frames)
+    return SceneData(hold_out(frames), half_size, points, colors, unsplit=frames, warnings=warnings)
 
 
 def _model_files(folder: Path) -> list[Path]:
@@ -58,17 +62,32 @@ def _frame(folder: Path, files: list[Path], image: ModelImage, camera: ModelCame
     field = f"images[{image.name}]"
     if camera is None:
         raise DatasetInvalid(files[1], field, f"has camera {image.camera_id}, which is not in {files[0].name}")
-    image_path = folder / "images" / image.name
-    if not image_path.is_file():
-        raise DatasetInvalid(files[1], field, f"is in the model, but there is no file {image_path}")
+    image_path = find_file(folder / IMAGES, image.name)
+    if image_path is None:
+        problem = f"is in the model, but there is no file {folder / IMAGES / posix(image.name)}"
+        raise DatasetInvalid(files[1], field, f"{problem}: {not_found(folder / IMAGES, image.name)}")
     stored, stated = read_size(image_path), ImageSize(camera.width, camera.height)
     if not stated.has_shape_of(stored):
         raise DatasetInvalid(files[1], field, f"has a camera for {stated}, but the image is {stored}")
     pinhole = _pinhole(files, image, camera).resized(*stored)
     distortion = Distortion(**{key: camera.values.get(key, 0.0) for key in Distortion._fields})
     distortion = checked_distortion(distortion, pinhole, files[0], f"cameras[{image.camera_id}]")
-    name = "_".join(PurePosixPath(image.name).with_suffix("").parts)
-    return Frame(name, reduced(pinhole, size, image_path), 0.0, image_path, distortion)
+    mask = find_mask(folder / MASKS, image.name)
+    mask = None if mask is None else checked_mask(mask, stored, image_path)
+    name = "_".join(posix(image.name).with_suffix("").parts)
+    return Frame(name, reduced(pinhole, size, image_path), 0.0, image_path, distortion, mask)
+
+
+def _mask_warnings(folder: Path, frames: list[Frame]) -> tuple[str, ...]:
+    """A warning if a folder of masks has none for some images."""
+    without = [frame for frame in frames if frame.mask_path is None]
+    if not without or not folder.is_dir() or not any(folder.iterdir()):
+        return ()
+    name = without[0].image_path.relative_to(folder.parent / IMAGES).as_posix()
+    problem = (
+        f"{folder}: {len(without)} of {len(frames)} images have no mask, so that all their pixels count, first {name}"
+    )
+    return (f"{problem}; its mask is named {name}.png or as the image",)
 
 
 def _pinhole(files: list[Path], image: ModelImage, camera: ModelCamera) -> Camera:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msdgs_serve.scene.fields import FieldTable
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 PARAMETERS = {
@@ -24,6 +25,36 @@ MODEL_NAMES = (
     "EQUIRECTANGULAR",
 )
 """Indexed by the model number in binary files."""
+
+COLUMNS = (
+    "WIDTH",
+    "HEIGHT",
+    "QW",
+    "QX",
+    "QY",
+    "QZ",
+    "TX",
+    "TY",
+    "TZ",
+    "CAMERA_ID",
+    "NAME",
+    "X",
+    "Y",
+    "Z",
+    "R",
+    "G",
+    "B",
+)
+
+COLMAP_FIELDS = FieldTable(
+    "COLMAP",
+    {
+        **dict.fromkeys((*PARAMETERS, *COLUMNS, "masks/"), "applied"),
+        **dict.fromkeys(MODEL_NAMES[len(PARAMETERS) :], "refused"),
+        **dict.fromkeys(("IMAGE_ID", "POINTS2D[]", "POINT3D_ID", "ERROR", "TRACK[]"), "harmless"),
+    },
+)
+"""Camera models and the columns of the three files."""
 
 
 class ModelCamera(NamedTuple):

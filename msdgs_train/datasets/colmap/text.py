@@ -1,5 +1,6 @@
 """COLMAP's `cameras.txt`, `images.txt` and `points3D.txt`: one record per line, comments after `#`."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,6 +9,8 @@ import numpy as np
 
 from msdgs_train.datasets.colmap.model import ModelCamera, ModelImage, make_camera
 from msdgs_train.datasets.common.readers import DatasetInvalid, read_bytes
+
+LINE_END = re.compile(r"\r\n?|\n")
 
 
 def read_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
@@ -20,15 +23,39 @@ def read_cameras(file: Path) -> Iterator[tuple[int, ModelCamera]]:
 
 
 def read_images(file: Path) -> Iterator[ModelImage]:
-    lines = _lines(file)
-    for number, line in lines:
-        if line:
-            with _record(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of observations"):
-                _, *words, camera_id, name = line.split(maxsplit=9)
-                pose = np.array(words, float).reshape(7)
-                image = ModelImage(name, int(camera_id), pose[:4], pose[4:])
-            next(lines, None)
-            yield image
+    """Each image is a line, with or without a line of observations after it."""
+    may_be_observations = False
+    for number, line in _lines(file):
+        if not line:
+            continue
+        if may_be_observations and _has_observations(line):
+            may_be_observations = False
+            continue
+        with _record(file, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, or then X Y POINT3D_ID…"):
+            _, *words, camera_id, name = line.split(maxsplit=9)
+            pose = np.array(words, float).reshape(7)
+            image = ModelImage(name, int(camera_id), pose[:4], pose[4:])
+        may_be_observations = True
+        yield image
+
+
+def _has_observations(line: str) -> bool:
+    """Whether a line is X Y POINT3D_ID again and again. Only its beginning and its end are read: it may be long."""
+    words, last = line.split(maxsplit=12), line.rsplit(maxsplit=1)[-1]
+    is_whole = len(words) > 12 or len(words) % 3 == 0
+    return is_whole and all(map(_is_number, words[:12])) and all(map(_is_integer, (*words[2:12:3], last)))
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_integer(word: str) -> bool:
+    return word.removeprefix("-").isdecimal()
 
 
 def read_points(file: Path) -> Iterator[tuple[float, ...]]:
@@ -40,13 +67,13 @@ def read_points(file: Path) -> Iterator[tuple[float, ...]]:
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Yield lines with their numbers, without comments; empty ones are kept: an image may have no observations."""
+    """Yield lines with their numbers, without comments."""
     try:
-        text = read_bytes(file).decode()
+        text = read_bytes(file).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DatasetInvalid(file, "file", f"is not text: {error}") from None
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.startswith("#"):
+        raise DatasetInvalid(file, "file", f"is not text in UTF-8: byte {error.start} doesn't belong to it") from None
+    for number, line in enumerate(LINE_END.split(text), start=1):
+        if not line.lstrip().startswith("#"):
             yield number, line.strip()
 
 

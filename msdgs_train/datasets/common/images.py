@@ -37,18 +37,24 @@ def read_size(path: Path) -> ImageSize:
 
 def read_rgba(path: Path) -> np.ndarray:
     """Read [H, W, 4] uint8, straight alpha; gray becomes RGB, without alpha it is opaque. Raises `DatasetInvalid`."""
-    reader = _open(path)
-    pixels = reader.read_image("uint8")
-    problem = reader.geterror()
-    reader.close()
-    if pixels is None:
-        raise _unreadable(path, problem.splitlines()[0] if problem else "no pixels")
+    pixels = read_pixels(path, "uint8")
     channels = pixels.shape[2]
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     rgba[..., :3] = pixels[..., :3] if channels >= 3 else pixels[..., :1]
     if channels in (2, 4):
         rgba[..., 3] = pixels[..., -1]
     return rgba
+
+
+def read_pixels(path: Path, dtype: str) -> np.ndarray:
+    """Read [H, W, channels] as "uint8" or "uint16", whose largest value is that of the file's type."""
+    reader = _open(path)
+    pixels = reader.read_image(dtype)
+    problem = reader.geterror()
+    reader.close()
+    if pixels is None:
+        raise _unreadable(path, problem.splitlines()[0] if problem else "no pixels")
+    return pixels
 
 
 def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -2,13 +2,17 @@
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from msdgs_serve.scene import MsdgsError
+from msdgs_serve.scene.fields import FieldTable
+
+MAX_NAMES = 12
+"""Fields that one warning names."""
 
 
 class DatasetInvalid(MsdgsError):
@@ -85,8 +89,10 @@ def read_json(file: Path) -> JsonObject:
     """Read the object in a JSON file. Raises `DatasetInvalid` if there is none."""
     try:
         content = json.loads(read_bytes(file))
-    except (ValueError, RecursionError) as error:
-        raise DatasetInvalid(file, "file", f"is not JSON: {error}") from None
+    except json.JSONDecodeError as error:
+        raise DatasetInvalid(file, "file", f"is not JSON: line {error.lineno}, column {error.colno}") from None
+    except (ValueError, RecursionError):
+        raise DatasetInvalid(file, "file", "is not JSON") from None
     if not isinstance(content, dict):
         raise DatasetInvalid(file, "file", "must hold a JSON object")
     return JsonObject(file, content)
@@ -96,11 +102,22 @@ def read_table(file: Path, columns: int) -> np.ndarray:
     """Read [M, columns] finite numbers from a `.npy` file; M may be 0. Raises `DatasetInvalid` naming file and row."""
     try:
         table = np.lib.format.read_array(io.BytesIO(read_bytes(file)), allow_pickle=False)
-    except ValueError as error:
-        raise DatasetInvalid(file, "file", f"is not a NumPy array: {error}") from None
+    except ValueError:
+        raise DatasetInvalid(file, "file", "is not a NumPy array of numbers, or is cut off") from None
     if table.dtype.kind not in "fiu" or table.shape[1:] != (columns,):
-        raise DatasetInvalid(file, "file", f"must hold real numbers in shape M×{columns}")
+        got = f"{table.dtype} in shape {'×'.join(map(str, table.shape))}"
+        raise DatasetInvalid(file, "file", f"must hold real numbers in shape M×{columns}, got {got}")
     return finite_rows(file, "row {}", table)
+
+
+def unread_fields(file: Path, table: FieldTable, names: Iterable[str]) -> list[str]:
+    """A warning that names those fields of a file that are in no table; none if there are none."""
+    unlisted = table.unlisted(names)
+    if not unlisted:
+        return []
+    are = "is not a known field" if len(unlisted) == 1 else "are not known fields"
+    shown = ", ".join(f"`{name}`" for name in unlisted[:MAX_NAMES]) + ", …" * (len(unlisted) > MAX_NAMES)
+    return [f"{file}: {shown} {are} of {table.format}, and not read: check that nothing depends on it"]
 
 
 def finite_rows(file: Path, field: str, table: np.ndarray) -> np.ndarray:

@@ -12,7 +12,9 @@ from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.datasets.common.distortion import Distortion, undistort
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import read_rgba, resize_area
+from msdgs_train.datasets.common.masks import WHITE, as_rgba, read_mask
 from msdgs_train.datasets.common.normalization import are_at_one_place, find_subject, normalization, seen_depths
+from msdgs_train.datasets.common.readers import DatasetInvalid
 
 SPLITS = ("train", "val", "test")
 HELD_OUT = 8
@@ -41,13 +43,33 @@ class Frame:
     t: float
     image_path: Path
     distortion: Distortion | None = None  # of the stored image; `load_rgba` removes it
+    mask_path: Path | None = None  # an image of the stored image's size, black where pixels don't count
 
     def load_rgba(self) -> np.ndarray:
         """Read [height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.
 
         Raises `DatasetInvalid` if the file can't be read.
         """
-        rgba = read_rgba(self.image_path)
+        return self._as_camera(read_rgba(self.image_path))
+
+    def load_mask(self) -> np.ndarray | None:
+        """Read [height, width] bool, true where the pixels of `load_rgba` count; None if all do.
+
+        A pixel counts if all of the stored pixels that it was made of do. Raises `DatasetInvalid`, also if none does.
+        """
+        if self.mask_path is None:
+            return None
+        mask = self._as_camera(as_rgba(read_mask(self.mask_path)))[..., 0] == WHITE
+        if not mask.any():
+            problem = f"leaves no pixel of {self.image_path} at {self.camera.width}×{self.camera.height}: white pixels "
+            raise DatasetInvalid(self.mask_path, "mask", problem + "count, black ones don't. Leave this image out")
+        return mask
+
+    def downscale_mask(self, mask: np.ndarray) -> np.ndarray:
+        """Downscale a mask of this frame, bool [H, W], to the camera's size, as `load_mask` does."""
+        return self.downscale(as_rgba(mask))[..., 0] == WHITE
+
+    def _as_camera(self, rgba: np.ndarray) -> np.ndarray:
         if self.distortion is not None:
             height, width, _ = rgba.shape
             rgba = undistort(rgba, self.camera.resized(width, height), self.distortion)
@@ -111,14 +133,11 @@ class SceneData:
         if scene_to_world == own:
             return self
 
-        def moved(frames: list[Frame]) -> list[Frame]:
-            cameras = (scene_to_world.camera_to_scene(own.camera_to_world(frame.camera)) for frame in frames)
-            return [replace(frame, camera=camera) for frame, camera in zip(frames, cameras, strict=True)]
+        def moved(frame: Frame) -> Frame:
+            return replace(frame, camera=scene_to_world.camera_to_scene(own.camera_to_world(frame.camera)))
 
         points = None if self.points is None else scene_to_world.to_scene(own.to_world(self.points))
-        splits = {split: moved(frames) for split, frames in self.splits.items()}
-        unsplit = None if self.unsplit is None else moved(self.unsplit)
-        scene = replace(self, splits=splits, unsplit=unsplit, points=points, scene_to_world=scene_to_world)
+        scene = replace(self._with_each(moved), points=points, scene_to_world=scene_to_world)
         return (
             scene if self.has_nominal_size else replace(scene, scene_half_size=scene_half_size(points, scene.cameras))
         )
@@ -128,6 +147,10 @@ class SceneData:
         """First and last time of the frames of all splits; equal in a static scene."""
         times = [frame.t for frames in self.splits.values() for frame in frames]
         return min(times), max(times)
+
+    def without_masks(self) -> "SceneData":
+        """The same scene, all pixels of which count."""
+        return self._with_each(lambda frame: replace(frame, mask_path=None))
 
     def in_unit_time(self) -> "SceneData":
         """The same scene; if times outside [0, 1] occur, all are scaled to it: layers take float32, and expect that."""
@@ -139,12 +162,7 @@ class SceneData:
 
     def retimed(self, time: Callable[[Frame], float]) -> "SceneData":
         """The same scene, with another time of each frame."""
-
-        def changed(frames: list[Frame]) -> list[Frame]:
-            return [replace(frame, t=time(frame)) for frame in frames]
-
-        splits = {split: changed(frames) for split, frames in self.splits.items()}
-        return replace(self, splits=splits, unsplit=None if self.unsplit is None else changed(self.unsplit))
+        return self._with_each(lambda frame: replace(frame, t=time(frame)))
 
     def split_again(self, every: int) -> "SceneData":
         """Split the training frames, or all frames of a dataset that names no splits, as `DataConfig.llffhold` says.
@@ -156,6 +174,11 @@ class SceneData:
         if not splits["train"]:
             raise InvalidInput("llffhold", f"fewer than the {len(frames)} training images", every)
         return replace(self, splits=splits)
+
+    def _with_each(self, change: Callable[[Frame], Frame]) -> "SceneData":
+        splits = {split: [change(frame) for frame in frames] for split, frames in self.splits.items()}
+        unsplit = None if self.unsplit is None else [change(frame) for frame in self.unsplit]
+        return replace(self, splits=splits, unsplit=unsplit)
 
 
 def reduced(camera: Camera, size: int | None, image_path: Path) -> Camera:

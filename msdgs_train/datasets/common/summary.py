@@ -20,6 +20,8 @@ def summary(scene: SceneData) -> str:
         f"{_count(len(times), 'time')} from {first:g} to {last:g}" if len(times) > 1 else "one time",
         _count(len(scene.points), "point") if scene.points is not None else "no points",
     ]
+    if masked := sum(frame.mask_path is not None for frame in frames):
+        parts.append(f"masks of {'all' if masked == len(frames) else f'{masked:,}'} images")
     if not place.is_identity:
         x, y, z = place.offset
         parts.append(f"trained at 1/{place.scale:g} of its size around ({x:g}, {y:g}, {z:g})")

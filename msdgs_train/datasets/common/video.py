@@ -5,11 +5,15 @@ busy cores, against milliseconds from stored pixels. Therefore the first access 
 frame by frame and downscaled to the training size, into one uint8 `.npy` file [F, H, W, 3], which is memory-mapped from
 then on and reused by later runs. At most one frame is held as an array at a time.
 
+Frames are turned and mirrored as the video's display matrix says, as every player and FFmpeg do; sizes are those of
+the turned frames.
+
 The files are in `$XDG_CACHE_HOME/msdgs/videos`, or else `~/.cache/msdgs/videos`, and may be deleted if no training is
 running: 1.2 GB for 300 frames of 1352×1014. Their names depend on the video's path, size and modification time.
 """
 
 import hashlib
+import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,13 +27,30 @@ from msdgs_train.datasets.common.files import replacing
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame
 
+MAX_TILT = 0.02
+"""Sine of the angle, about 1°, up to which a display matrix is taken for one of a right angle, as FFmpeg does."""
+
+
+class Turn(NamedTuple):
+    """What the display matrix does to a frame: rows and columns are exchanged first, then it is mirrored."""
+
+    transposed: bool = False
+    mirrored: bool = False  # left to right
+    upside_down: bool = False  # top to bottom
+
+    def __call__(self, pixels: np.ndarray) -> np.ndarray:
+        """The frame as it is shown, from [H, W, …] as it is stored."""
+        shown = pixels.swapaxes(0, 1) if self.transposed else pixels
+        return shown[:: -1 if self.upside_down else 1, :: -1 if self.mirrored else 1]
+
 
 class VideoInfo(NamedTuple):
-    """The header of a video; sizes in pixels."""
+    """The header of a video; sizes in pixels, of frames as they are shown."""
 
     count: int
     width: int
     height: int
+    turn: Turn = Turn()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,28 +59,50 @@ class VideoFrame(Frame):
 
     video: Path
     index: int
-    count: int  # number of frames in the video
+    info: VideoInfo  # of the video
 
     def load_rgba(self) -> np.ndarray:
         """Read [height, width, 4] uint8, sRGB, opaque, of the camera's size. The first call decodes the video."""
         width, height = self.camera.width, self.camera.height
-        frames = open_frames(self.video, VideoInfo(self.count, width, height))
+        frames = open_frames(self.video, self.info._replace(width=width, height=height))
         rgba = np.full((height, width, 4), 255, np.uint8)
         rgba[..., :3] = frames[self.index]
         return rgba
 
 
 def read_info(video: Path) -> VideoInfo:
-    """Read the count and size of the frames, without decoding any. Raises `DatasetInvalid` naming the file."""
+    """Read the count, size and display matrix of the frames, of which only the first is decoded. Raises
+    `DatasetInvalid` naming the file."""
     with _opened(video) as container:
         if not container.streams.video:
             raise _invalid(video, "has no video stream")
         stream = container.streams.video[0]
         width, height = stream.codec_context.width, stream.codec_context.height
-        count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
-    if count < 1:
-        raise _invalid(video, "has no frames")
-    return VideoInfo(count, width, height)
+        first = next(container.decode(stream), None)
+        if first is None:
+            raise _invalid(video, "has no frames")
+        turn = _turn(video, first.side_data.get("DISPLAYMATRIX"))
+        count = stream.frames
+    if not count:
+        with _opened(video) as container:
+            count = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
+    return VideoInfo(count, *((height, width) if turn.transposed else (width, height)), turn)
+
+
+def _turn(video: Path, display_matrix: Any) -> Turn:
+    """The turn by a display matrix of FFmpeg, in which (a b, c d) sends column x, row y to (a x + c y, b x + d y)."""
+    if display_matrix is None or not any(np.frombuffer(bytes(display_matrix), np.int32)[:5]):
+        return Turn()
+    a, b, _, c, d = np.frombuffer(bytes(display_matrix), np.int32)[:5].tolist()
+    straight, across = min(abs(a), abs(d)), min(abs(b), abs(c))
+    if max(abs(b), abs(c)) < MAX_TILT * straight:
+        return Turn(False, a < 0, d < 0)
+    if max(abs(a), abs(d)) < MAX_TILT * across:
+        return Turn(True, c < 0, b < 0)
+    degrees = math.degrees(math.atan2(b, a))
+    raise _invalid(
+        video, f"is shown turned by {degrees:.1f}°, but must be by multiples of 90°: encode it again, turned so"
+    )
 
 
 def open_frames(video: Path, wanted: VideoInfo) -> np.ndarray:
@@ -121,11 +164,12 @@ def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
         from av.video.reformatter import Interpolation
 
         area = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-        stream = container.streams.video[0]
+        stream, turn = container.streams.video[0], wanted.turn
         stream.thread_type = "AUTO"
         for frame in container.decode(stream):
-            size = {"width": wanted.width, "height": wanted.height}
-            yield np.ascontiguousarray(frame.to_ndarray(format="rgb24", interpolation=area, **size))
+            width, height = (wanted.height, wanted.width) if turn.transposed else (wanted.width, wanted.height)
+            pixels = frame.to_ndarray(format="rgb24", interpolation=area, width=width, height=height)
+            yield np.ascontiguousarray(turn(pixels))
 
 
 @contextmanager

@@ -143,7 +143,7 @@ def test_lists_of_file_names_make_the_splits(tmp_path: Path):
 def test_times_outside_0_and_1_are_scaled(tmp_path: Path):
     content = nerfstudio_json(3)
     for frame, time in zip(content["frames"], [12.5, -3, 28], strict=True):
-        frame |= {"time": time, "mask_path": "masks/none.png"}  # masks are ignored
+        frame["time"] = time
     scene = load_scene(write_nerfstudio(tmp_path, content=content))
     assert [frame.t for frame in scene.splits["test"] + scene.splits["train"]] == [0.5, 0.0, 1.0]
     assert scene.time_range == (0.0, 1.0)
