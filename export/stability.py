@@ -8,6 +8,10 @@ if __name__ == "__main__":  # as a file, from any folder: the checkout's package
     folder = Path(__file__).resolve().parent
     sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
 
+    from msdgs_serve.process import begin
+
+    begin()
+
 from export.command_line import Console, run, tyro
 from export.options import require_folder_of
 from msdgs_serve.scene.errors import InvalidInput

@@ -23,10 +23,12 @@ import OpenImageIO as oiio
 from msdgs_serve.blocks import Block, OutputOptions, View, draw_block, plan_blocks
 from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, check_fps, orbit_path, read_path_file, read_scene_names
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.files import in_words, writing
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
 from msdgs_serve.imaging.formats import default_channels
+from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
@@ -35,7 +37,6 @@ from msdgs_serve.video import VIDEO_FORMATS, VideoFormat, check_size, require_py
 
 PROGRAM = "msdgs-render"
 USAGE_ERROR = 2
-INTERRUPTED = 130
 RECORD = "msdgs-render.json"
 
 EXAMPLES = """\
@@ -58,9 +59,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _run(options)
     except KeyboardInterrupt:
         print(f"\n{PROGRAM}: stopped; the same command continues from here", file=sys.stderr)
-        return INTERRUPTED
+        return EXIT_INTERRUPTED
     except (MsdgsError, OSError) as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
+        print(f"{PROGRAM}: {in_words(error)}", file=sys.stderr)
         return USAGE_ERROR
     return 0
 
@@ -124,7 +125,7 @@ def _run(options: argparse.Namespace) -> None:
     _draw(views, files, OutputOptions(image_format, options.quality, drawn), options.ray)
     if is_video:
         unfinished = options.out.with_name(f".{options.out.name}.part")
-        with unfinished.open("wb") as file:
+        with writing(options.out, unfinished.name), unfinished.open("wb") as file:
             write_video(_images(files), fps, cast(VideoFormat, video), file)
         os.replace(unfinished, options.out)
         shutil.rmtree(folder)
@@ -201,10 +202,16 @@ def _draw(views: Sequence[View], files: Sequence[Path], look: OutputOptions, ray
             frames = draw_on_ray(plan_blocks(views, missing, cores), look, cores)
         started = time.monotonic()
         for done, (number, body) in enumerate(frames, start=1):
-            unfinished = files[number].with_name(f".{files[number].name}.part")
-            unfinished.write_bytes(body)
-            os.replace(unfinished, files[number])
+            _write(files[number], body)
             _show_progress(done, len(missing), time.monotonic() - started)
+
+
+def _write(file: Path, contents: bytes) -> None:
+    """Write a file, atomically."""
+    unfinished = file.with_name(f".{file.name}.part")
+    with writing(file, unfinished.name):
+        unfinished.write_bytes(contents)
+        os.replace(unfinished, file)
 
 
 def _draw_here(blocks: Sequence[Block], look: OutputOptions) -> Iterator[tuple[int, bytes]]:
@@ -261,9 +268,7 @@ def _claim(folder: Path, record: str) -> None:
         return
     if any(not each.name.startswith(".") for each in folder.iterdir()):
         raise InvalidInput("out", "an empty folder, or one of an earlier run of this command", folder)
-    unfinished = folder / f".{RECORD}.part"
-    unfinished.write_text(record)
-    os.replace(unfinished, file)
+    _write(file, record.encode())
 
 
 if __name__ == "__main__":

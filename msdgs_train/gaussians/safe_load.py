@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from msdgs_serve.files import reason
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.datasets.common.files import replacing
 
@@ -24,9 +25,16 @@ class CheckpointInvalid(MsdgsError):
 
 
 def save_atomic(path: str | Path, obj: Any) -> None:
-    """Write `obj` with `torch.save`, atomically."""
-    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
-        torch.save(obj, file)
+    """Write `obj` with `torch.save`, atomically. Raises `WriteFailed`."""
+    with replacing(Path(path)) as temporary:
+        try:
+            with temporary.open("wb") as file:
+                torch.save(obj, file)
+        except RuntimeError as error:  # of the archive's end, which hides the error that broke it off
+            cause: BaseException | None = error
+            while cause is not None and not isinstance(cause, OSError | KeyboardInterrupt):
+                cause = cause.__context__
+            raise cause or error from None
 
 
 def load(path: str | Path) -> Any:
@@ -46,11 +54,11 @@ def load(path: str | Path) -> Any:
     except FileNotFoundError as error:
         raise CheckpointInvalid(path, "no such file") from error
     except OSError as error:
-        raise CheckpointInvalid(path, f"can't be read: {error.strerror or error}") from error
+        raise CheckpointInvalid(path, f"can't be read: {reason(error)}") from error
     except CheckpointInvalid:
         raise
     except Exception as error:  # a damaged pickle raises errors of any type
-        raise CheckpointInvalid(path, f"isn't a whole torch checkpoint of plain values: {error}") from error
+        raise CheckpointInvalid(path, "isn't a whole torch checkpoint of tensors and plain values alone") from error
 
 
 def refuse_unlike_stored(path: str | Path, tensors: Mapping[str, Tensor]) -> None:

@@ -16,7 +16,8 @@ from av.video.reformatter import ColorRange
 from msdgs_serve import blocks, render_cli
 from msdgs_serve.camera_path import read_nerfstudio
 from msdgs_serve.imaging import Image, encode
-from msdgs_serve.render_cli import INTERRUPTED, main
+from msdgs_serve.process import EXIT_INTERRUPTED
+from msdgs_serve.render_cli import main
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.threads import THREADS_VARIABLE
@@ -191,7 +192,7 @@ def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pyt
 
     command = (scene, video, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
     monkeypatch.setattr(blocks, "encode", encode_two)
-    assert run(*command) == INTERRUPTED
+    assert run(*command) == EXIT_INTERRUPTED
     assert not video.exists()
     monkeypatch.setattr(blocks, "encode", lambda image, *more: drawn.append(image.t) or encode(image, *more))
     assert run(*command) == 0
@@ -210,7 +211,7 @@ def test_a_frame_that_was_cut_off_is_named(
     command = (scene, tmp_path / "orbit.mp4", "--frames", 2, "--width", 64, "--height", 64)
     with monkeypatch.context() as stopped:
         stopped.setattr(render_cli, "write_video", stop)
-        assert run(*command) == INTERRUPTED
+        assert run(*command) == EXIT_INTERRUPTED
     frame = tmp_path / "orbit.mp4.frames" / "frame_00001.png"
     whole = frame.read_bytes()
     for size in (0, 50, len(whole) // 2):
