@@ -5,9 +5,9 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
-from msdgs_serve.files import in_words
 from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.writing import in_words
 
 try:
     import tyro

@@ -8,7 +8,6 @@ import hashlib
 import itertools
 import json
 import math
-import os
 import shutil
 import sys
 import time
@@ -23,7 +22,6 @@ import OpenImageIO as oiio
 from msdgs_serve.blocks import Block, OutputOptions, View, draw_block, plan_blocks
 from msdgs_serve.camera_path import DEFAULT_FPS, CameraPath, check_fps, orbit_path, read_path_file, read_scene_names
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.files import in_words, writing
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
@@ -34,6 +32,7 @@ from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
 from msdgs_serve.scene import InvalidInput, MsdgsError
 from msdgs_serve.video import VIDEO_FORMATS, VideoFormat, check_size, require_pyav, write_video
+from msdgs_serve.writing import in_words, replacing, write_text, writing
 
 PROGRAM = "msdgs-render"
 USAGE_ERROR = 2
@@ -124,10 +123,8 @@ def _run(options: argparse.Namespace) -> None:
     drawn = RenderOptions(background, motion_dt=options.dt, depth="depth" in default_channels(image_format))
     _draw(views, files, OutputOptions(image_format, options.quality, drawn), options.ray)
     if is_video:
-        unfinished = options.out.with_name(f".{options.out.name}.part")
-        with writing(options.out, unfinished.name), unfinished.open("wb") as file:
+        with replacing(options.out) as temporary, temporary.open("wb") as file:
             write_video(_images(files), fps, cast(VideoFormat, video), file)
-        os.replace(unfinished, options.out)
         shutil.rmtree(folder)
     print(f"wrote {options.out}: {len(files)} frames of {first.width} × {first.height}")
 
@@ -193,7 +190,7 @@ def _draw(views: Sequence[View], files: Sequence[Path], look: OutputOptions, ray
         print(f"{len(files) - len(missing)} of {len(files)} frames exist already")
     if not missing:
         return
-    with ExitStack() as stack:
+    with writing(files[0].parent), ExitStack() as stack:
         if ray is None:
             frames = _draw_here(plan_blocks(views, missing), look)
         else:
@@ -202,16 +199,9 @@ def _draw(views: Sequence[View], files: Sequence[Path], look: OutputOptions, ray
             frames = draw_on_ray(plan_blocks(views, missing, cores), look, cores)
         started = time.monotonic()
         for done, (number, body) in enumerate(frames, start=1):
-            _write(files[number], body)
+            with replacing(files[number]) as temporary:
+                temporary.write_bytes(body)
             _show_progress(done, len(missing), time.monotonic() - started)
-
-
-def _write(file: Path, contents: bytes) -> None:
-    """Write a file, atomically."""
-    unfinished = file.with_name(f".{file.name}.part")
-    with writing(file, unfinished.name):
-        unfinished.write_bytes(contents)
-        os.replace(unfinished, file)
 
 
 def _draw_here(blocks: Sequence[Block], look: OutputOptions) -> Iterator[tuple[int, bytes]]:
@@ -262,13 +252,13 @@ def _claim(folder: Path, record: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / RECORD
     if file.exists():
-        if file.read_text() != record:
+        if file.read_text(encoding="utf-8", errors="replace") != record:
             expected = "an empty folder, or one with frames of the same scenes, path and format"
             raise InvalidInput("out", expected, f"{folder}, with frames of another command")
         return
     if any(not each.name.startswith(".") for each in folder.iterdir()):
         raise InvalidInput("out", "an empty folder, or one of an earlier run of this command", folder)
-    _write(file, record.encode())
+    write_text(file, record)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
-from msdgs_train.datasets.common.files import replacing, temporary_folder, write_text
+from msdgs_serve.writing import replacing, temporary_folder, write_text
 
 LOSSLESS, LOSSY = 60.0, 45.0
 """Default minimum PSNR of a written file against the scene, dB."""

@@ -10,9 +10,9 @@ import numpy as np
 from export.importers.scene import UP
 from export.importers.splats.axes import from_right_up_back, upright
 from export.importers.splats.base import as_float32
-from msdgs_serve.files import WriteFailed
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.writing import WriteFailed
 
 FRAMES_PER_SECOND = 24
 EXTENT = 3.0

@@ -18,7 +18,7 @@ from export.options import ExportOptions, require_folder_of
 from export.progress import tracked
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.datasets.common.files import scratch_folder
+from msdgs_serve.writing import scratch_folder
 
 FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep_float32", "duration")
 """The options that splats and sequences have; nothing is pruned or fitted."""

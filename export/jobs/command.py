@@ -22,7 +22,7 @@ from export.plans.registry import parse
 from export.progress import Track, tracked
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.datasets.common.files import scratch_folder
+from msdgs_serve.writing import scratch_folder
 from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import tyro
 from rich.console import Console
 
-from msdgs_serve.files import in_words
 from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.writing import in_words
 from msdgs_train.cli.bench import Bench
 from msdgs_train.cli.compare import Compare
 from msdgs_train.cli.console import EXIT_INVALID

@@ -16,11 +16,11 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from msdgs_serve.files import in_words
 from msdgs_serve.process import STOPPING
 from msdgs_serve.ray_tasks import RayTasks, ray_cluster
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_serve.writing import in_words
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.run import EVAL_SPLITS, fit

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from msdgs_serve.files import writing
-from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_serve.writing import replacing, write_text, writing
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.engine.run_record import CURVE, METRICS, RENDERS
 from msdgs_train.engine.tensorboard_events import FOLDER, add_scalars, open_events

@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
-from msdgs_serve.files import WriteFailed, writing
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.writing import WriteFailed, write_text, writing
 from msdgs_train.datasets import SceneData, load_scene
-from msdgs_train.datasets.common.files import write_text
 from msdgs_train.datasets.identity import identity
 from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.config import TrainConfig, check_resumable

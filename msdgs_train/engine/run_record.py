@@ -6,9 +6,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from msdgs_serve.files import reason
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
-from msdgs_train.datasets.common.files import write_text
+from msdgs_serve.writing import reason, write_text
 from msdgs_train.datasets.identity import differences
 from msdgs_train.engine.config import TrainConfig
 

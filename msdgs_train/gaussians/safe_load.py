@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from msdgs_serve.files import reason
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.datasets.common.files import replacing
+from msdgs_serve.writing import reason, replacing
 
 PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
 PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 
-from msdgs_serve.files import scratch_file, writing
+from msdgs_serve.files import scratch_file
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.writing import writing
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
@@ -82,6 +83,7 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
     spec.attribute("oiio:UnassociatedAlpha", 1)
     writer = oiio.ImageOutput.create("png")
+    assert writer is not None
     with writing(path), scratch_file() as (scratch, contents):  # the library doesn't notice a full disk
         if not (writer.open(scratch, spec) and writer.write_image(pixels) and writer.close()):
             raise ValueError(f"no PNG of {width} × {height} pixels: {writer.geterror()}")

@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from msdgs_serve.files import reason
-from msdgs_train.datasets.common.files import replacing
+from msdgs_serve.writing import reason, replacing
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame
 

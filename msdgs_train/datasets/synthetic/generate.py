@@ -16,7 +16,7 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
-from msdgs_train.datasets.common.files import temporary_folder
+from msdgs_serve.writing import temporary_folder
 from msdgs_train.datasets.common.images import composite, resize_area, write_png
 from msdgs_train.datasets.synthetic.rendering import render
 from msdgs_train.datasets.synthetic.trajectories import trajectories
