@@ -24,6 +24,9 @@ def scratch_file() -> Iterator[tuple[str, Callable[[], bytes]]]:
         handle = os.memfd_create("image")
         try:
             yield f"/proc/self/fd/{handle}", lambda: _read_all(handle)
+        except Exception:
+            _require_whole(handle)
+            raise
         finally:
             os.close(handle)
     else:
@@ -33,10 +36,17 @@ def scratch_file() -> Iterator[tuple[str, Callable[[], bytes]]]:
 
 
 def _read_all(handle: int) -> bytes:
-    size = os.fstat(handle).st_size
-    if size == resource.getrlimit(resource.RLIMIT_FSIZE)[0]:  # libraries don't notice that a file is cut off there
-        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    size = _require_whole(handle)
     return b"".join(os.pread(handle, MAX_READ_BYTES, start) for start in range(0, size, MAX_READ_BYTES))
+
+
+def _require_whole(handle: int) -> int:
+    """Return a file's size. Raises `OSError` if the system has cut it off there, which libraries don't notice or name
+    otherwise."""
+    size = os.fstat(handle).st_size
+    if size == resource.getrlimit(resource.RLIMIT_FSIZE)[0]:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+    return size
 
 
 class Signature(NamedTuple):

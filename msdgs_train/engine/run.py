@@ -26,6 +26,7 @@ from msdgs_train.engine.run_record import (
     Best,
     RunRecord,
     read_record,
+    remove_temporaries,
     require_no_run,
     require_same_dataset,
     stored_config,
@@ -122,6 +123,7 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
             if trainer.step_count >= config.run.steps and stored.run.minutes != config.run.minutes:
                 raise InvalidInput("config.minutes", "unchanged, as the run is finished", config.run.minutes)
         lock = lock or on_error.enter_context(_locked(folder))
+        remove_temporaries(folder)
         write_config(folder, config)
         best = _best_so_far(folder, earlier, scene) if earlier else None
         record = RunRecord(data.absolute(), best, dataset)

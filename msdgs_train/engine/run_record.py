@@ -99,6 +99,13 @@ def require_no_run(folder: Path) -> None:
         raise InvalidInput("run", expected, f"{folder}, which holds {', '.join(held)}: {remedy}")
 
 
+def remove_temporaries(run: Path) -> None:
+    """Remove the temporary files of killed runs of version 0.2 and earlier. The run must be locked."""
+    for name in map(Path, KEPT):
+        for file in run.glob(f".{name.stem}.????????{name.suffix}"):
+            file.unlink()
+
+
 def stored_config(run: Path) -> TrainConfig:
     """Return the settings of a run that can be resumed. Raises `InvalidInput` if there is none, and `RunInvalid`."""
     if not (run / CONFIG).exists():
