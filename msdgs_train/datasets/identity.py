@@ -31,9 +31,13 @@ TAIL = 1 << 14
 """Bytes at the end of a file that stand for its contents, with its size: a PNG ends with a checksum of its pixels, and
 a change of a JPEG moves all that follows."""
 
-DECIMALS, SLACK = 7, 1e-3
-"""Decimals of values relative to a power of ten above them, as the last digits of what is computed depend on the
-machine. The slack keeps 1 and what is computed as 1 below the same power."""
+DECIMALS, DIFFERENCE_DECIMALS = 7, 10
+"""Decimals of values relative to a power of ten above them, and of differences relative to one above what was
+subtracted: the last of 16 digits of what is computed depend on the machine, and few values may be at an edge."""
+
+SMALLEST = 1e-9  # in place of 0
+SLACK = 1e-3
+"""Keeps 1 and what is computed as 1 below the same power of ten."""
 
 
 def identity(scene: SceneData) -> dict[str, Any]:
@@ -45,7 +49,7 @@ def identity(scene: SceneData) -> dict[str, Any]:
         "images": len(frames),
         "names": _digest([[split, unicodedata.normalize("NFC", frame.name)] for split, frame in splits]),
         "times": _digest(_rounded([frame.t for frame in frames])),
-        "cameras": _digest([_rounded(rows) for rows in _cameras(frames)]),
+        "cameras": _digest(list(_cameras(frames))),
         "files": _digest([_contents(file) for file in files]),
     }
 
@@ -56,22 +60,25 @@ def differences(stored: Mapping[str, Any], found: Mapping[str, Any]) -> list[str
 
 
 def _cameras(frames: list[Frame]) -> Iterator[Any]:
-    """Numbers of all cameras, by magnitude; positions relative to the first, which may be far from the origin."""
+    """Rounded numbers of all cameras; positions relative to the first, which may be far from the origin."""
     cameras = [frame.camera for frame in frames]
     positions = np.array([camera.camera_to_world[:3, 3] for camera in cameras])
-    yield [(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) for camera in cameras]
-    yield [camera.camera_to_world[:3, :3] for camera in cameras]
-    yield positions[0]
-    yield positions - positions[0]
-    yield [(*frame.camera.distortion, *(frame.distortion or Distortion())) for frame in frames]
+    yield _rounded([(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height) for camera in cameras])
+    yield _rounded([camera.camera_to_world[:3, :3] for camera in cameras])
+    yield _rounded(positions[0])
+    yield _rounded(positions - positions[0], of=positions)
+    yield _rounded([(*frame.camera.distortion, *(frame.distortion or Distortion())) for frame in frames])
 
 
-def _rounded(values: Any) -> list[Any]:
-    """Numbers in units of a power of ten below the largest, as whole numbers, after this power."""
-    array = np.array(values, np.float64)
-    largest = np.abs(array).max(initial=0)
-    power = math.ceil(math.log10(largest) - SLACK) - DECIMALS if largest else 0
-    return [power, (array / 10.0**power).round().astype(np.int64).tolist()]
+def _rounded(values: Any, of: Any = 0.0) -> list[Any]:
+    """Numbers, or differences of the numbers `of`, in units of a power of ten, as whole numbers after this power."""
+    power = max(_power_above(values) - DECIMALS, _power_above(of) - DIFFERENCE_DECIMALS)
+    return [power, (np.array(values, np.float64) / 10.0**power).round().astype(np.int64).tolist()]
+
+
+def _power_above(values: Any) -> int:
+    """The exponent of a power of ten that no number is above; a very small one if all are 0."""
+    return math.ceil(math.log10(max(np.abs(values).max(initial=0), SMALLEST)) - SLACK)
 
 
 def _contents(file: Path) -> list[Any]:

@@ -16,6 +16,7 @@ from functools import cache
 from pathlib import Path
 
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.writing import in_words
 
 GROUP = "msdgs.plugins"
 VARIABLE = "MSDGS_PLUGINS"
@@ -78,8 +79,9 @@ def _named(name: str) -> Iterator[None]:
     try:
         yield
     except (Exception, SystemExit) as error:  # its code may raise anything
-        kind = "" if isinstance(error, MsdgsError) else f"{type(error).__name__}: "
-        problem = f"{name}: {_place(error)}{kind}{error}"
+        known = isinstance(error, MsdgsError | OSError)
+        what = in_words(error) if known else f"{type(error).__name__}: {error}"
+        problem = f"{name}: {_place(error)}{what}"
         raise InvalidInput("plugin", "a module that can be imported, or a Python file", problem) from error
 
 
