@@ -22,6 +22,7 @@ from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.threads import THREADS_VARIABLE
 from msdgs_serve.video import BT709, VideoFormat, write_video
+from tests.support.file_sizes import largest_file
 from tests.support.images import decode, psnr
 from tests.support.scene_files import level_camera
 from tests.support.service import check_problem, serving
@@ -179,6 +180,23 @@ def test_images_of_an_orbit(scene: Path, tmp_path: Path, capsys: pytest.CaptureF
     printed = capsys.readouterr()
     assert "3 frames of 20 × 10" in printed.out
     assert "frame 3 of 3" in printed.err
+
+
+@pytest.mark.parametrize(
+    ("out", "size", "named"),
+    [("frames", 300, "frames"), ("orbit.mp4", 1500, "orbit.mp4"), ("frames", 60, "frames/msdgs-render.json")],
+)
+def test_on_a_full_disk_the_file_is_named_and_the_same_command_continues(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, size: int, named: str
+):
+    command = (scene, tmp_path / out, "--frames", 3, "--width", 20, "--height", 20)
+    with largest_file(size):
+        assert run(*command) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith(f"msdgs-render: {tmp_path / named}")
+    assert ": can't be written: a file may not be as large there" in error
+    assert not list(tmp_path.rglob(".msdgs-*"))
+    assert run(*command) == 0
 
 
 def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -281,10 +281,13 @@ def begun(systems_file: Path, data: Path, out: Path) -> Iterator[subprocess.Pope
         yield process
 
 
-def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_saves_and_the_same_command_goes_on(
+    systems_file: Path, data: Path, tmp_path: Path, number: signal.Signals
+) -> None:
     out = tmp_path / "out"
     with begun(systems_file, data, out) as process:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         output = process.communicate(timeout=600)[0]
     assert process.returncode == cli.EXIT_INTERRUPTED, output
     assert "static, scene, seed 0: interrupted" in output
