@@ -88,7 +88,7 @@ class FitProgress(Observer):
         return self._stop.is_set()
 
     def _print(self, line: str, style: str | None = None) -> None:
-        with contextlib.suppress(OSError, SystemExit):  # rich exits if nobody reads
+        with contextlib.suppress(OSError, SystemExit):  # rich exits if the output is not read
             console.print(line, style=style, soft_wrap=True)
 
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:

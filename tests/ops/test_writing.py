@@ -97,7 +97,7 @@ def test_errors_about_other_files_are_their_own(tmp_path: Path):
         (tmp_path / "source").read_bytes()
     assert not isinstance(failed.value, WriteFailed)
     assert in_words(failed.value) == f"{tmp_path / 'source'}: there is no such file or folder"
-    with pytest.raises(BrokenPipeError) as ended, writing(tmp_path):  # of the output, if nobody reads it
+    with pytest.raises(BrokenPipeError) as ended, writing(tmp_path):  # of an output that is not read
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
     assert in_words(ended.value) == "Broken pipe"
 

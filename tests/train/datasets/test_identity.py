@@ -43,7 +43,7 @@ def test_a_copy_is_the_same(original: Path, copy: Path):
     assert not differing(original, copy)
 
 
-def paint_a_pixel(folder: Path) -> None:
+def flip_a_bit(folder: Path) -> None:
     file = folder / "train" / "r_003.png"
     pixels = read_rgba(file)
     pixels[11, 5] ^= 1
@@ -90,7 +90,7 @@ def leave_out_an_image(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("edit", "told"),
     [
-        (paint_a_pixel, {"contents of images"}),
+        (flip_a_bit, {"contents of images"}),
         (encode_again, {"contents of images"}),
         (exchange, {"contents of images"}),
         (move_a_camera, {"cameras"}),

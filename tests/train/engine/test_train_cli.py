@@ -152,7 +152,7 @@ def test_interrupted_and_resumed(data: Path, tmp_path: Path, number: signal.Sign
 
 
 class Unread:
-    """An output that nobody reads, as of a pager that has ended."""
+    """An output that is not read, as of a pager that has ended."""
 
     encoding = "utf-8"
 
@@ -163,7 +163,7 @@ class Unread:
         raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
 
-def test_training_goes_on_if_nobody_reads_its_output(
+def test_training_goes_on_if_its_output_is_not_read(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     progress = FitProgress(2)
