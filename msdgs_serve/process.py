@@ -29,12 +29,12 @@ def begin() -> None:
 
 @contextmanager
 def stopped_by(handler: Callable[[int, FrameType | None], object]) -> Iterator[None]:
-    """Call `handler` for the signals that are to stop a command, except those that are ignored, as by nohup. Only the
-    main thread may receive signals: elsewhere this does nothing."""
+    """Call `handler` for the signals that are to stop a command, except for a closed terminal that is ignored, as by
+    nohup. Only the main thread may receive signals: elsewhere this does nothing."""
     old = {}
     if threading.current_thread() is threading.main_thread():
-        numbers = [number for number in STOPPING if signal.getsignal(number) is not signal.SIG_IGN]
-        old = {number: signal.signal(number, handler) for number in numbers}
+        stays = signal.SIGHUP if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else None
+        old = {number: signal.signal(number, handler) for number in STOPPING if number != stays}
     try:
         yield
     finally:

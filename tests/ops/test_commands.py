@@ -53,6 +53,7 @@ def test_ctrl_c_during_imports_is_one_line(command: str, arguments: list[str], p
         text=True,
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": path},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # jobs in the background ignore it
     ) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == "importing\n"
@@ -76,13 +77,17 @@ def test_signals_that_stop_a_command_are_handled_in_a_block(number: signal.Signa
         os.kill(os.getpid(), number)
     assert received == [number]
     assert {each: signal.getsignal(each) for each in STOPPING} == before
-    signal.signal(number, signal.SIG_IGN)
+
+
+def test_a_terminal_that_is_closed_is_ignored_if_it_was():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    received: list[int] = []
     try:
         with stopped_by(lambda number, frame: received.append(number)):
-            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGHUP)
     finally:
-        signal.signal(number, before[number])
-    assert received == [number], "one that is ignored, as by nohup, stays so"
+        signal.signal(signal.SIGHUP, before)
+    assert not received
 
 
 WARNING = "from msdgs_serve.process import begin; begin(); import numpy; numpy.float32(1e38) * numpy.float32(10)"
