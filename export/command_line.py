@@ -5,7 +5,9 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
+from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.writing import in_words
 
 try:
     import tyro
@@ -27,7 +29,7 @@ def run(command: Callable[[Console], int | None], on_interrupt: str) -> int:
         return command(console) or 0
     except KeyboardInterrupt:
         console.print(on_interrupt, markup=False)
-        return 130
+        return EXIT_INTERRUPTED
     except (MsdgsError, OSError) as error:
-        console.print(f"error: {error}", style="red", markup=False)
+        console.print(f"error: {in_words(error)}", style="red", markup=False)
         return 1

@@ -1,12 +1,18 @@
 """`python export/stability.py model.pt`: the error of float32 and lower precision against float64."""
 
 import sys
-from pathlib import Path
-from typing import Annotated
+from os.path import dirname, realpath
 
 if __name__ == "__main__":  # as a file, from any folder: the checkout's packages, not this folder's modules
-    folder = Path(__file__).resolve().parent
-    sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
+    folder = dirname(realpath(__file__))
+    sys.path[:] = [dirname(folder), *(path for path in sys.path if realpath(path or ".") != folder)]
+
+    from msdgs_serve.process import begin
+
+    begin()
+
+from pathlib import Path
+from typing import Annotated
 
 from export.command_line import Console, run, tyro
 from export.options import require_folder_of

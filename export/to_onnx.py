@@ -1,11 +1,15 @@
 """`python export/to_onnx.py model.pt`: one ONNX scene file from a trained model, as fast as its error may be."""
 
 import sys
-from pathlib import Path
+from os.path import dirname, realpath
 
 if __name__ == "__main__":  # as a file, from any folder: the checkout's packages, not this folder's modules
-    folder = Path(__file__).resolve().parent
-    sys.path[:] = [str(folder.parent), *(p for p in sys.path if Path(p or ".").resolve() != folder)]
+    folder = dirname(realpath(__file__))
+    sys.path[:] = [dirname(folder), *(path for path in sys.path if realpath(path or ".") != folder)]
+
+    from msdgs_serve.process import begin
+
+    begin()
 
 from export.command_line import Console, run, tyro
 from export.options import ExportOptions, with_values_of_up

@@ -8,7 +8,6 @@ import hashlib
 import itertools
 import json
 import math
-import os
 import shutil
 import sys
 import time
@@ -27,15 +26,16 @@ from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
 from msdgs_serve.imaging.formats import default_channels
+from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
 from msdgs_serve.scene import InvalidInput, MsdgsError
 from msdgs_serve.video import PIXELS, VIDEO_FORMATS, VideoFormat, check_size, pixels_of, require_pyav, write_video
+from msdgs_serve.writing import in_words, replacing, write_text, writing
 
 PROGRAM = "msdgs-render"
 USAGE_ERROR = 2
-INTERRUPTED = 130
 RECORD = "msdgs-render.json"
 
 EXAMPLES = """\
@@ -58,12 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _run(options)
     except KeyboardInterrupt:
         print(f"\n{PROGRAM}: stopped; the same command continues from here", file=sys.stderr)
-        return INTERRUPTED
-    except MsdgsError as error:
-        print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return USAGE_ERROR
-    except OSError as error:
-        print(f"{PROGRAM}: {error.filename or options.out}: {error.strerror or 'not readable'}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except (MsdgsError, OSError) as error:
+        print(f"{PROGRAM}: {in_words(error)}", file=sys.stderr)
         return USAGE_ERROR
     return 0
 
@@ -126,10 +123,8 @@ def _run(options: argparse.Namespace) -> None:
     drawn = RenderOptions(background, motion_dt=options.dt, depth="depth" in default_channels(image_format))
     _draw(views, files, OutputOptions(image_format, options.quality, drawn), options.ray)
     if is_video:
-        unfinished = options.out.with_name(f".{options.out.name}.part")
-        with unfinished.open("wb") as file:
+        with replacing(options.out) as temporary, temporary.open("wb") as file:
             write_video(_images(files), fps, cast(VideoFormat, video), file)
-        os.replace(unfinished, options.out)
         shutil.rmtree(folder)
     print(f"wrote {options.out}: {len(files)} frames of {first.width} × {first.height}")
     if is_video and pixels_of(cast(VideoFormat, video), first.width, first.height) != PIXELS:
@@ -204,7 +199,7 @@ def _draw(views: Sequence[View], files: Sequence[Path], look: OutputOptions, ray
         print(f"{len(files) - len(missing)} of {len(files)} frames exist already")
     if not missing:
         return
-    with ExitStack() as stack:
+    with writing(files[0].parent), ExitStack() as stack:
         if ray is None:
             frames = _draw_here(plan_blocks(views, missing), look)
         else:
@@ -213,9 +208,8 @@ def _draw(views: Sequence[View], files: Sequence[Path], look: OutputOptions, ray
             frames = draw_on_ray(plan_blocks(views, missing, cores), look, cores)
         started = time.monotonic()
         for done, (number, body) in enumerate(frames, start=1):
-            unfinished = files[number].with_name(f".{files[number].name}.part")
-            unfinished.write_bytes(body)
-            os.replace(unfinished, files[number])
+            with replacing(files[number]) as temporary:
+                temporary.write_bytes(body)
             _show_progress(done, len(missing), time.monotonic() - started)
 
 
@@ -267,15 +261,13 @@ def _claim(folder: Path, record: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / RECORD
     if file.exists():
-        if file.read_text() != record:
+        if file.read_text(encoding="utf-8", errors="replace") != record:
             expected = "an empty folder, or one with frames of the same scenes, path and format"
             raise InvalidInput("out", expected, f"{folder}, with frames of another command")
         return
     if any(not each.name.startswith(".") for each in folder.iterdir()):
         raise InvalidInput("out", "an empty folder, or one of an earlier run of this command", folder)
-    unfinished = folder / f".{RECORD}.part"
-    unfinished.write_text(record)
-    os.replace(unfinished, file)
+    write_text(file, record)
 
 
 if __name__ == "__main__":

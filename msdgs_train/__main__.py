@@ -2,9 +2,12 @@
 
 import sys
 
+from msdgs_serve.process import begin
+
 
 def main() -> int:
     """Entry point; returns the exit code."""
+    begin()
     try:
         from msdgs_train.cli.main import main
     except ModuleNotFoundError as error:

@@ -19,7 +19,7 @@ from benchmarks.rasterizer.scenes import Case, file_cases, object_scene, seeded_
 from benchmarks.rasterizer.stages import Gradient, draw_in_stages, memory_of, row_of, work_of
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import MsdgsError
-from msdgs_train.datasets.common.files import write_text
+from msdgs_serve.writing import write_text
 from tests.support.splat_files import splat_bytes
 
 

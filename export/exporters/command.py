@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import onnx
@@ -31,7 +30,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.metadata import SceneMetadata
 from msdgs_serve.scene.similarity import Similarity
-from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_serve.writing import replacing, temporary_folder, write_text
 
 LOSSLESS, LOSSY = 60.0, 45.0
 """Default minimum PSNR of a written file against the scene, dB."""
@@ -135,13 +134,12 @@ def _sequence(session: DeformationSession, options: ConvertOptions, console: Con
     if any(each.suffix == ".ply" for each in out.iterdir()):
         raise InvalidInput("out", "a folder without PLY files", str(out))
     digits = len(str(len(times) - 1))
-    with TemporaryDirectory(prefix=".frames.", dir=out) as temporary:
-        folder = Path(temporary)
+    with temporary_folder(out, out) as folder:
         worst = min(
             _one(session, options, folder / f"{options.scene.stem}_{number:0{digits}}.ply", t)
             for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
         )
-        for file in sorted(folder.iterdir()):
+        for file in sorted(folder.glob("*.ply")):
             file.replace(out / file.name)
     return f"{len(times)} files, the worst {worst:.1f} dB"
 

@@ -1,5 +1,6 @@
 """A scene as OpenUSD: one ParticleField3DGaussianSplat with a time sample of its poses per frame."""
 
+import errno
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from export.importers.splats.axes import from_right_up_back, upright, upright_of
 from export.importers.splats.base import as_float32
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.writing import WriteFailed
 
 FRAMES_PER_SECOND = 24
 EXTENT = 3.0
@@ -75,7 +77,11 @@ def write_usd(
         stage.SetTimeCodesPerSecond(FRAMES_PER_SECOND)
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(len(times) - 1)
-    stage.Export(str(file))
+    try:
+        stage.Export(str(file))
+    except RuntimeError:  # OpenUSD doesn't tell why
+        problem = OSError(errno.EIO, "OpenUSD couldn't write it; is there space on the disk?")
+        raise WriteFailed(file, problem) from None
 
 
 def _extent(means: np.ndarray, scales: np.ndarray) -> np.ndarray:

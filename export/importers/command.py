@@ -1,6 +1,5 @@
 """The inputs of `to_onnx.py` other than a model.pt."""
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -23,6 +22,7 @@ from export.options import ExportOptions, require_folder_of
 from export.progress import tracked
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.writing import scratch_folder
 
 FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep_float32", "duration", "up")
 """The options that splats and sequences have; nothing is pruned or fitted."""
@@ -52,8 +52,8 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
     elif file_format in RUNS:
         if file_format == "4dgs" and options.data is not None and (options.data / "dataset.json").exists():
             raise InvalidInput("data", "left out: 4DGaussians trains in HyperNeRF's unscaled coordinates", options.data)
-        with tempfile.TemporaryDirectory(prefix="msdgs-import-") as folder:
-            model = Path(folder) / "model.pt"
+        with scratch_folder() as folder:
+            model = folder / "model.pt"
             lost = write_model(path, file_format, model, console)
             yield model
             if lost:

@@ -23,7 +23,7 @@ from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.similarity import IDENTITY, Similarity
-from msdgs_train.datasets.common.files import replacing
+from msdgs_serve.writing import replacing
 
 WITHIN = (0.01, 0.99)
 """Quantiles of the centers along each axis that make the bounds, since strays of a trained scene are often far away."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,6 +22,7 @@ from export.plans.registry import parse
 from export.progress import Track, tracked
 from export.pruning import RULES
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.writing import scratch_folder
 from msdgs_train.gaussians.model_file import load_model
 
 if TYPE_CHECKING:
@@ -41,15 +41,12 @@ NARROW_COLUMNS = ("", "plan", "pruned to", "SH", "moving", "ms", "MB", "worst fr
 def export(model: Path, options: ExportOptions, console: Console) -> None:
     """Choose a candidate, verify it and write it. An error leaves files that were there as they are."""
     _check(options)
-    with (
-        tempfile.TemporaryDirectory(prefix="msdgs-export-") as folder,
-        tracked(console) as track,
-    ):
+    with scratch_folder() as folder, tracked(console) as track:
         images = _held_out_images(model, options.data, track)
         rules = [rule for rule in RULES if rule not in options.keep]
         packs, result = STORAGE not in options.keep, None
         limits = {"min_psnr": options.min_psnr, "max_bytes": options.max_mb and round(1e6 * options.max_mb)}
-        job = ExportJob(model, Path(folder), **limits, rules=rules, packs=packs, images=images, progress=track)
+        job = ExportJob(model, folder, **limits, rules=rules, packs=packs, images=images, progress=track)
         if options.chosen_plan is None:
             result = Sweep(job).run()
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error

@@ -15,7 +15,7 @@ from export.measure.machine import processor
 from export.plans.base import BASELINE
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
-from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_serve.writing import replacing, write_text
 
 FORMAT = "msdgs-report/1"
 COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {

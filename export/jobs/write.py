@@ -12,7 +12,7 @@ from onnx import helper
 from export.measure.verify import TIMES, TOLERANCE, differences, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene, SceneMetadata
-from msdgs_train.datasets.common.files import replacing
+from msdgs_serve.writing import replacing
 from msdgs_train.gaussians.model import DynamicGaussians
 
 

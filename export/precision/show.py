@@ -13,7 +13,7 @@ from export.measure.stability import assess
 from export.precision.formats import FORMATS
 from export.precision.report import StabilityReport, WorstGaussians
 from export.progress import tracked
-from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_serve.writing import replacing, write_text
 from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
 

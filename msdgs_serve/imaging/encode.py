@@ -1,15 +1,12 @@
 """Encode images as files with OpenImageIO and NumPy. Equal images give equal bytes."""
 
 import io
-import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import OpenImageIO as oiio
 
+from msdgs_serve.files import scratch_file
 from msdgs_serve.imaging.display import DepthRange, channel_of, display_image
 from msdgs_serve.imaging.exr_header import camera_attributes
 from msdgs_serve.imaging.formats import CHANNELS, DEFAULT_QUALITY, FORMATS, Channel, ImageFormat, default_channels
@@ -41,10 +38,6 @@ EXR_NAMES: dict[Channel, tuple[str, ...]] = {
     "motion": ("forward.u", "forward.v"),
     "gaussians": ("gaussians",),
 }
-
-
-MAX_READ_BYTES = 1 << 30
-"""Limit of bytes per read, below that of any system."""
 
 oiio.attribute("threads", 1)  # 3 times as fast for a 400 × 400 JPEG as with its own threads, which busy-wait
 
@@ -172,30 +165,7 @@ def _write(pixels: np.ndarray, spec: oiio.ImageSpec, image_format: ImageFormat) 
     output = oiio.ImageOutput.create(FORMATS[image_format].plugin or "")
     if output is None:
         raise EncodingFailed(f"no writer for {image_format}: {oiio.geterror()}")
-    with _scratch_file() as (path, contents):
+    with scratch_file() as (path, contents):
         if not (output.open(path, spec) and output.write_image(np.ascontiguousarray(pixels)) and output.close()):
             raise EncodingFailed(f"cannot write {image_format}: {output.geterror()}")
         return contents()
-
-
-@contextmanager
-def _scratch_file() -> Iterator[tuple[str, Callable[[], bytes]]]:
-    """Yield a path to write to and a function that reads it; in memory on Linux.
-
-    Every system call may pass the interpreter to another thread, so there are few.
-    """
-    if hasattr(os, "memfd_create"):
-        handle = os.memfd_create("image")
-        try:
-            yield f"/proc/self/fd/{handle}", lambda: _read_all(handle)
-        finally:
-            os.close(handle)
-    else:
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "image"
-            yield str(path), path.read_bytes
-
-
-def _read_all(handle: int) -> bytes:
-    size = os.fstat(handle).st_size
-    return b"".join(os.pread(handle, MAX_READ_BYTES, start) for start in range(0, size, MAX_READ_BYTES))

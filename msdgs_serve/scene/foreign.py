@@ -21,7 +21,9 @@ def foreign_file(start: bytes, name: str) -> str | None:
         return LFS_POINTER
     if start.startswith(b"PK") and b"data.pkl" in start:
         return _to_import("a model", name)
-    if start.startswith((b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b", b"PK")):
+    if start.startswith(b"PK"):
+        return f"{_to_import('a zip', name)} if it holds a splat"
+    if start.startswith((b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b")):
         return _to_import("a splat", name)
     return foreign_name(name)
 

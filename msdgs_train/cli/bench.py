@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_train.cli.compare import check_jobs, comparison_progress
-from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console
+from msdgs_train.cli.console import EXIT_INVALID, console
 from msdgs_train.comparison.matrix import Budget, read_systems
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID, console, progress_bar, rich_table
+from msdgs_train.cli.console import EXIT_INVALID, console, progress_bar, rich_table
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 
 if TYPE_CHECKING:

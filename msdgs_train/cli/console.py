@@ -8,7 +8,6 @@ from rich.progress import Progress, ProgressColumn
 from rich.table import Table
 
 EXIT_INVALID = 2
-EXIT_INTERRUPTED = 130  # the exit code of a shell for a program that Ctrl-C has stopped
 
 console = Console(markup=False)  # names of files may have brackets
 

@@ -12,8 +12,9 @@ from typing import Annotated, Any, get_type_hints
 
 import tyro
 
+from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli.console import EXIT_INTERRUPTED, console
+from msdgs_train.cli.console import console
 from msdgs_train.cli.parts import PARTS
 from msdgs_train.cli.view import open_viewer
 from msdgs_train.engine.config import TrainConfig

@@ -1,7 +1,7 @@
 """Terminal output of `msdgs-train fit`: phases, a progress bar, metrics, and Ctrl-C as a clean stop."""
 
+import contextlib
 import shlex
-import signal
 import threading
 import time
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any, Self
 
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from msdgs_serve.process import stopped_by
 from msdgs_train.cli.console import console, progress_bar
 from msdgs_train.datasets.common.summary import summary
 from msdgs_train.engine.observer import Observer
@@ -25,7 +26,8 @@ PLAIN_LINE_SECONDS = 10.0  # between lines if the output is not a terminal
 class FitProgress(Observer):
     """Shows a bar with loss, PSNR, Gaussians and speed, or prints lines if the output is not a terminal.
 
-    The first Ctrl-C stops the run after the current step, the second one at once.
+    The first Ctrl-C stops the run after the current step, the second one at once; so do the signals that end a process
+    or tell that its terminal was closed. Training goes on if the output can't be written, as when a pager has ended.
     """
 
     def __init__(self, steps: int) -> None:
@@ -34,21 +36,20 @@ class FitProgress(Observer):
         self._first: tuple[int, float] | None = None  # step and time that the speed is measured from
         self._taken = 0  # optimizer steps since then; with `minutes` each stands for several steps of the schedule
         self._next_update = 0.0
-        self._old_handler: Any = None
+        self._signals = stopped_by(self._on_interrupt)
         state, left = TextColumn("{task.fields[state]}"), TimeRemainingColumn(elapsed_when_finished=True)
         self._bar = progress_bar(BarColumn(None), MofNCompleteColumn(), state, TimeElapsedColumn(), left)
         self._task = self._bar.add_task("fit", total=steps, state="reading images, compiling kernels")
 
     def __enter__(self) -> Self:
-        if threading.current_thread() is threading.main_thread():
-            self._old_handler = signal.signal(signal.SIGINT, self._on_interrupt)
+        self._signals.__enter__()
         self._bar.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-        if self._old_handler is not None:
-            signal.signal(signal.SIGINT, self._old_handler)
+    def __exit__(self, *error: Any) -> None:
+        with contextlib.suppress(OSError, SystemExit):
+            self._bar.stop()
+        self._signals.__exit__(*error)
 
     def on_train_start(self, trainer: Trainer) -> None:
         self._print(summary(trainer.scene))
@@ -91,7 +92,8 @@ class FitProgress(Observer):
         return self._stop.is_set()
 
     def _print(self, line: str, style: str | None = None) -> None:
-        console.print(line, style=style, soft_wrap=True)
+        with contextlib.suppress(OSError, SystemExit):  # rich exits if the output is not read
+            console.print(line, style=style, soft_wrap=True)
 
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         if self._stop.is_set():

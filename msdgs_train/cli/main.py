@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import tyro
 from rich.console import Console
 
+from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.writing import in_words
 from msdgs_train.cli.bench import Bench
 from msdgs_train.cli.compare import Compare
-from msdgs_train.cli.console import EXIT_INTERRUPTED, EXIT_INVALID
+from msdgs_train.cli.console import EXIT_INVALID
 from msdgs_train.cli.evaluate import Eval
 from msdgs_train.cli.fit import Fit, parse_fit
 from msdgs_train.cli.steps import Steps
@@ -33,7 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Console(stderr=True).print("interrupted")
         return EXIT_INTERRUPTED
     except (MsdgsError, OSError) as error:
-        Console(stderr=True).print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+        Console(stderr=True).print(
+            f"error: {in_words(error)}", style="red", markup=False, highlight=False, soft_wrap=True
+        )
         return EXIT_INVALID
 
 

@@ -20,10 +20,10 @@ import torch
 from llvmlite.binding import get_host_cpu_name
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.writing import write_text
 from msdgs_train.comparison.matrix import Run, require_unique
 from msdgs_train.comparison.pools import RunEnd, processes
 from msdgs_train.comparison.runner import final_metrics, train_all
-from msdgs_train.datasets.common.files import write_text
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.evaluation.evaluate import evaluate_run

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from msdgs_serve.writing import write_text
 from msdgs_train.comparison.bench import SPLITS, Row
 from msdgs_train.comparison.report import mean_and_deviation, save_figure
-from msdgs_train.datasets.common.files import write_text
 from msdgs_train.evaluation.report import markdown_table
 
 TABLE, PLOT = "bench.md", "bench.png"

@@ -4,26 +4,32 @@ import dataclasses
 import multiprocessing
 import os
 import signal
+import threading
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from msdgs_serve.process import STOPPING
 from msdgs_serve.ray_tasks import RayTasks, ray_cluster
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_serve.writing import in_words
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.run import EVAL_SPLITS, fit
-from msdgs_train.engine.run_record import CHECKPOINT
+from msdgs_train.engine.run_record import CONFIG
 from msdgs_train.engine.trainer import Trainer
 
 POLL_SECONDS = 0.5
 _stop: Event | None = None  # set in a worker process by its parent
+_terminated = threading.Event()  # set by a signal to this process
 
 
 class RunEnd(NamedTuple):
@@ -47,7 +53,11 @@ class Processes:
 
     def submit(self, run: Run) -> None:
         """Start a run, or continue it."""
-        self._going[self._executor.submit(_train_here, run)] = run
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOPPING)  # of a new process, until it is prepared for them
+        try:
+            self._going[self._executor.submit(_train_here, run)] = run
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
 
     def finished(self, timeout: float | None = None) -> Iterator[tuple[Run, RunEnd]]:
         """Yield the runs that have ended, after waiting for the first of them, up to `timeout` seconds.
@@ -91,6 +101,7 @@ def processes(jobs: int) -> Iterator[Processes]:
     """A pool of processes of this machine."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
+    resource_tracker.ensure_running()  # which unblocks signals when it starts
     with ProcessPoolExecutor(jobs, context, _prepare, (stop,)) as executor:
         yield Processes(jobs, executor, stop)
 
@@ -146,7 +157,7 @@ def _train_on_ray(flag: list[Any], folder: Path, run: Run) -> RunEnd:
 
 
 def _train_here(run: Run) -> RunEnd:
-    ended = _train(run, lambda: _is_orphan() or (_stop is not None and _stop.is_set()))
+    ended = _train(run, lambda: _is_orphan() or _terminated.is_set() or (_stop is not None and _stop.is_set()))
     if _is_orphan():
         os._exit(1)  # the executor would wait for more work forever
     return ended
@@ -160,13 +171,12 @@ def _is_orphan() -> bool:
 def _train(run: Run, is_stopped: Callable[[], bool]) -> RunEnd:
     """Train one run, from its checkpoint if there is one, until `is_stopped`."""
     os.environ[THREADS_VARIABLE] = str(run.config.run.threads)
-    run.folder.mkdir(parents=True, exist_ok=True)
-    resume = (run.folder / CHECKPOINT).exists()
+    resume = (run.folder / CONFIG).exists()
     try:
         result = fit(run.config, run.data, run.folder, resume=resume, observer=_ComparisonObserver(is_stopped))
-    except MsdgsError as error:
-        return RunEnd("failed", str(error))
-    except Exception as error:  # of a plugin or the operating system; other runs continue
+    except (MsdgsError, OSError) as error:
+        return RunEnd("failed", in_words(error))
+    except Exception as error:  # of a plugin; other runs continue
         traceback.print_exc()
         return RunEnd("failed", repr(error))
     return RunEnd(result.status)
@@ -175,4 +185,8 @@ def _train(run: Run, is_stopped: Callable[[], bool]) -> RunEnd:
 def _prepare(stop: Event) -> None:
     global _stop
     _stop = stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes; the parent passes it on
+    for number in STOPPING:  # a terminal sends them to all processes; the parent passes them on
+        signal.signal(number, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: _terminated.set())  # sent to each, also by the executor
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPPING)
+    warnings.simplefilter("ignore")  # as in the parent

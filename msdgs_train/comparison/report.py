@@ -18,8 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from msdgs_serve.writing import replacing, write_text
 from msdgs_train.comparison.results import Result
-from msdgs_train.datasets.common.files import replacing, write_text
 from msdgs_train.evaluation.report import markdown_table
 from msdgs_train.layers.parts import to_text
 

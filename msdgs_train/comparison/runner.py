@@ -1,12 +1,12 @@
 """Training of the runs of a comparison, several in parallel, resumed after an interruption."""
 
 import json
-import signal
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
+from msdgs_serve.process import stopped_by
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import POLL_SECONDS, Pool, RunEnd
@@ -31,22 +31,21 @@ def train_all(runs: Sequence[Run], pool: AbstractContextManager[Pool], on_end: C
         return True
     interrupted = threading.Event()
     with pool as trainers:
-        # set here, after Ray has installed its own handler
-        old = signal.signal(signal.SIGINT, lambda *_: interrupted.set())
         try:
-            while waiting or len(trainers):
-                if interrupted.is_set():
-                    trainers.stop()
-                    waiting.clear()
-                while waiting and len(trainers) < trainers.jobs:
-                    trainers.submit(waiting.pop(0))
-                for run, end in trainers.finished(POLL_SECONDS):
-                    on_end(run, end)
+            with stopped_by(lambda *_: interrupted.set()):  # here, after Ray has installed its own handler
+                while waiting or len(trainers):
+                    if interrupted.is_set():
+                        trainers.stop()
+                        waiting.clear()
+                    while waiting and len(trainers) < trainers.jobs:
+                        trainers.submit(waiting.pop(0))
+                    for run, end in trainers.finished(POLL_SECONDS):
+                        on_end(run, end)
+                        if end.status == "interrupted":  # by a signal to its process
+                            interrupted.set()
         except BaseException:
             trainers.stop()  # or the pool would wait until its runs have ended
             raise
-        finally:
-            signal.signal(signal.SIGINT, old)
     return not interrupted.is_set()
 
 
@@ -62,8 +61,8 @@ def final_metrics(run: Run) -> dict[str, Any] | None:
         return json.loads((run.folder / FINAL_METRICS).read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
-    except ValueError as error:
-        raise InvalidInput("run", "a folder of a run", f"{run.folder / FINAL_METRICS}: {error}") from error
+    except ValueError:
+        raise InvalidInput("run", "a folder of a run", f"{run.folder}, whose {FINAL_METRICS} is damaged") from None
 
 
 def _check_settings(run: Run) -> None:

@@ -1,24 +1,22 @@
 """Metrics of a run as JSON lines and as a plot, and renderings beside their images."""
 
 import json
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from msdgs_train.datasets.common.files import replacing, write_text
+from msdgs_serve.writing import replacing, write_text, writing
 from msdgs_train.datasets.common.images import write_png
+from msdgs_train.engine.run_record import CURVE, METRICS, RENDERS
 from msdgs_train.engine.tensorboard_events import FOLDER, add_scalars, open_events
 from msdgs_train.engine.trainer import EvaluatedFrame, StepResult
 from msdgs_train.evaluation.metrics import ImageMetrics
 
 if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
-
-METRICS = "metrics.jsonl"
-CURVE = "curve.png"
-RENDERS = "renders"
 
 
 class MetricsLog:
@@ -44,7 +42,8 @@ class MetricsLog:
         write_text(self._run / METRICS, "".join(json.dumps(line) + "\n" for line in kept))
         self.close()
         if self._tensorboard:
-            self._events = open_events(self._run / FOLDER, kept, step + 1 if keep_evaluations else step)
+            with self._writing_events():
+                self._events = open_events(self._run / FOLDER, kept, step + 1 if keep_evaluations else step)
 
     def train(self, result: StepResult, seconds: float) -> None:
         """Add a line of training metrics."""
@@ -58,34 +57,41 @@ class MetricsLog:
         """Add a held-out image and its rendering, side by side; to TensorBoard only."""
         if self._events is not None:
             name = f"{split}/{_stem(evaluated)}"
-            self._events.add_image(name, side_by_side(evaluated), step, dataformats="HWC")
+            with self._writing_events():
+                self._events.add_image(name, side_by_side(evaluated), step, dataformats="HWC")
 
     def flush(self) -> None:
         """Write buffered events to disk."""
         if self._events is not None:
-            self._events.flush()
+            with self._writing_events():
+                self._events.flush()
 
     def close(self) -> None:
         """Close the event files."""
         if self._events is not None:
-            self._events.close()
+            with self._writing_events():
+                self._events.close()
+
+    def _writing_events(self) -> AbstractContextManager[None]:
+        folder = self._run / FOLDER
+        return writing(folder, str(folder))
 
     def _append(self, line: dict[str, Any]) -> None:
-        with (self._run / METRICS).open("a") as file:
+        with writing(self._run / METRICS), (self._run / METRICS).open("a", encoding="utf-8") as file:
             file.write(json.dumps(line) + "\n")
         if self._events is not None:
-            add_scalars(self._events, line)
+            with self._writing_events():
+                add_scalars(self._events, line)
 
 
 def read_metrics(run: Path) -> list[dict[str, Any]]:
-    """Read the lines of a run's `metrics.jsonl`, without an incomplete last one; none if there is no such file."""
+    """Read the lines of a run's `metrics.jsonl`, without those that a killed process has left incomplete; none if there
+    is no such file."""
     path = run / METRICS
     lines = []
-    for text in path.read_text().splitlines() if path.exists() else ():
-        try:
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else ():
+        with suppress(ValueError):
             lines.append(json.loads(text))
-        except json.JSONDecodeError:
-            break
     return lines
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.writing import WriteFailed, write_text, writing
 from msdgs_train.datasets import SceneData, load_scene
-from msdgs_train.datasets.common.files import write_text
+from msdgs_train.datasets.identity import identity
 from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.config import TrainConfig, check_resumable
 from msdgs_train.engine.metrics_log import MetricsLog, draw_curve, write_side_by_side
@@ -25,6 +26,9 @@ from msdgs_train.engine.run_record import (
     Best,
     RunRecord,
     read_record,
+    remove_temporaries,
+    require_no_run,
+    require_same_dataset,
     stored_config,
     write_config,
     write_record,
@@ -82,12 +86,17 @@ def fit(
 
     With `tensorboard`, metrics and held-out renderings are also written to `run/tensorboard` as events.
 
-    Raises `InvalidInput` if `run` holds another run and `resume` is false, or if a setting differs that a resumed run
-    may not change, and `ExtraMissing` if tensorboard isn't installed.
+    Raises `InvalidInput` if `run` holds another run and `resume` is false, or if the dataset differs, or a setting that
+    a resumed run may not change; `ExtraMissing` if tensorboard isn't installed; and `WriteFailed`, after which the last
+    checkpoint is whole.
     """
-    state = prepare(config, data, run, resume=resume, tensorboard=tensorboard)
-    with contextlib.closing(state.log), state.lock:
-        return Run(state, observer or Observer()).execute()
+    try:
+        state = prepare(config, data, run, resume=resume, tensorboard=tensorboard)
+        with contextlib.closing(state.log), state.lock:
+            return Run(state, observer or Observer()).execute()
+    except WriteFailed as error:
+        where = "from its last checkpoint" if (run / CHECKPOINT).exists() else "from its start"
+        raise WriteFailed(error.filename, error, f"Then --resume continues the run {where}") from error
 
 
 def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tensorboard: bool) -> RunState:
@@ -95,30 +104,31 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
     require_device(config.run.device)
     if tensorboard:
         require_tensorboard()
-    stored = stored_config(folder) if resume else None
+    stored, earlier = (stored_config(folder), read_record(folder)) if resume else (None, None)
     if stored:
         check_resumable(stored, config)
-    elif (folder / CHECKPOINT).exists():
-        raise InvalidInput("run", "a new folder, or --resume to continue the run in it", f"{folder}, which holds a run")
+    else:
+        require_no_run(folder)
     with contextlib.ExitStack() as on_error:
         lock = on_error.enter_context(_locked(folder)) if stored else None
         d = config.data
         scene = load_scene(data, d.size, d.llffhold, d.time_from, d.masks)
-        record = read_record(folder) if stored else None
-        scene = scene.normalized() if record is None else scene.in_frame(record.scene_to_world)
+        dataset = identity(scene)
+        if earlier:
+            require_same_dataset(folder, earlier, data, dataset)
+        scene = scene.in_frame(earlier.scene_to_world) if earlier else scene.normalized()
         trainer = Trainer(config, scene)
-        seconds = trainer.load_checkpoint(folder / CHECKPOINT) if stored else 0.0
+        continues = resume and (folder / CHECKPOINT).exists()
+        seconds = trainer.load_checkpoint(folder / CHECKPOINT) if continues else 0.0
         if stored:
             require_same_phase(Schedule.from_config(stored), Schedule.from_config(config), trainer.step_count)
             if trainer.step_count >= config.run.steps and stored.run.minutes != config.run.minutes:
                 raise InvalidInput("config.minutes", "unchanged, as the run is finished", config.run.minutes)
-        folder.mkdir(parents=True, exist_ok=True)
         lock = lock or on_error.enter_context(_locked(folder))
+        remove_temporaries(folder)
         write_config(folder, config)
-        best = _best_so_far(folder, trainer.scene) if resume else None
-        if best is None:
-            (folder / BEST).unlink(missing_ok=True)
-        record = RunRecord(data.absolute(), best, scene.scene_to_world)
+        best = _best_so_far(folder, earlier, scene) if earlier else None
+        record = RunRecord(data.absolute(), best, dataset, scene.scene_to_world)
         write_record(folder, record)
         is_finished = trainer.step_count >= config.run.steps  # its last model is evaluated again
         log = MetricsLog(
@@ -129,8 +139,11 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
 
 
 def _locked(folder: Path) -> IO[bytes]:
-    """A file that is locked until it is closed or the process ends; refused if another process trains in the folder."""
-    file = (folder / LOCK).open("wb")
+    """A file that is locked until it is closed or the process ends; refused if another process trains in the folder,
+    which is created if it doesn't exist."""
+    with writing(folder, str(folder)):
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("wb")
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -291,9 +304,8 @@ def _selection_split(scene: SceneData) -> str | None:
     return next((split for split in SELECTION_SPLITS if scene.splits.get(split)), None)
 
 
-def _best_so_far(folder: Path, scene: SceneData) -> Best | None:
-    record = read_record(folder)
-    best = record.best if record else None
+def _best_so_far(folder: Path, record: RunRecord, scene: SceneData) -> Best | None:
+    best = record.best
     return best if best and best.split == _selection_split(scene) and (folder / BEST).exists() else None
 
 

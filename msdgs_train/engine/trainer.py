@@ -148,7 +148,7 @@ class Trainer:
             self._restore(state)
             return float(state["seconds"])
         except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
-            problem = f"isn't a complete checkpoint of these settings ({error!r}): train again in a new folder"
+            problem = "isn't a complete checkpoint of these settings and this dataset: train again in a new folder"
             raise safe_load.CheckpointInvalid(path, problem) from error
 
     def roll_back(self, checkpoint: Path) -> None:
@@ -169,6 +169,8 @@ class Trainer:
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
         self.optimizer.load_state_dict(state["optimizer"])
         self._curriculum.order = state["curriculum"]
+        if any(index >= len(self.scene.splits["train"]) for index in self._curriculum.order):
+            raise LookupError("an image that this dataset doesn't have")
         self.skipped, self._skipped_in_a_row = state["skipped"]
         self.rollbacks = state["rollbacks"]
         for generator, stored in zip(self._generators(), state["generators"], strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import colormaps
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.datasets.common.files import write_text
+from msdgs_serve.writing import write_text
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine.metrics_log import to_bytes
 from msdgs_train.evaluation.evaluate import FILES, EvaluatedModel, Evaluation, Scores

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.datasets.common.files import replacing
+from msdgs_serve.writing import replacing
 
 DPI = 100
 MARGIN = 12  # pixels, around the sheet and between panels

@@ -1,5 +1,6 @@
 """`model.pt`: a trained model, which `eval`, `view` and the export read."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from msdgs_serve import __version__
 from msdgs_serve.scene.camera import Camera
-from msdgs_serve.scene.errors import MsdgsError
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.datasets.common.times import EXPECTED, is_time_from
@@ -86,6 +87,9 @@ def load_model(path: str | Path) -> LoadedModel:
         raise CheckpointInvalid(
             path, f"isn't a model of format {FORMAT} (found {found!r}): train or import it again with this version"
         )
+    missing = [name for name in ("config", "scene", "step", "state") if name not in contents]
+    if missing:
+        raise CheckpointInvalid(path, f"isn't a complete model: `{missing[0]}` is missing")
     try:
         state = contents["state"]
         refuse_unlike_stored(path, state)
@@ -95,21 +99,32 @@ def load_model(path: str | Path) -> LoadedModel:
         _refuse_unusable_scene(path, scene)
         return LoadedModel(model, scene, int(contents["step"]))
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
-        raise CheckpointInvalid(path, f"isn't a complete model: {error}") from error
+        problem = f": {error}" if isinstance(error, MsdgsError) else ", or one of another version"
+        raise CheckpointInvalid(path, f"isn't a complete model{problem}") from error
 
 
 def _build(config: ModelConfig, state: dict[str, Tensor]) -> DynamicGaussians:
-    """Build a model from its configuration and tensors. Raises `RuntimeError` naming missing and unexpected ones."""
+    """Build a model from its configuration and tensors. Raises `InvalidInput` naming a missing or unexpected one."""
     prefix = "gaussians."
     gaussians = {name.removeprefix(prefix): tensor for name, tensor in state.items() if name.startswith(prefix)}
+    absent = [name for name in CanonicalGaussians.__annotations__ if name not in gaussians]
+    if absent:
+        raise InvalidInput(prefix + absent[0], "a tensor", None)
     for layer in config.layers:
         layer.check_stored(len(state))
     with torch.device("meta"):  # sizes that disagree with the stored tensors take no memory here
-        DynamicGaussians(config, CanonicalGaussians(**gaussians)).load_state_dict(state, assign=True)
+        _check_tensors(DynamicGaussians(config, CanonicalGaussians(**gaussians)).state_dict(), state)
     model = DynamicGaussians(config, CanonicalGaussians(**gaussians))
     model.load_state_dict(state)
     model.support.check_attributes(model.gaussians.attributes)
     return model
+
+
+def _check_tensors(expected: Mapping[str, Tensor], stored: Mapping[str, Tensor]) -> None:
+    for name in {**expected, **stored}:
+        wanted, found = (tuple(each[name].shape) if name in each else None for each in (expected, stored))
+        if wanted != found:
+            raise InvalidInput(name, "absent" if wanted is None else f"a tensor of shape {wanted}", found)
 
 
 def _refuse_not_finite(path: str | Path, state: dict[str, Tensor]) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.foreign import LFS_POINTER, START_BYTES, is_lfs_pointer
-from msdgs_train.datasets.common.files import replacing
+from msdgs_serve.writing import reason, replacing
 
 PLAIN = {torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool}
 PLAIN |= {torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64}
@@ -25,9 +25,16 @@ class CheckpointInvalid(MsdgsError):
 
 
 def save_atomic(path: str | Path, obj: Any) -> None:
-    """Write `obj` with `torch.save`, atomically."""
-    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
-        torch.save(obj, file)
+    """Write `obj` with `torch.save`, atomically. Raises `WriteFailed`."""
+    with replacing(Path(path)) as temporary:
+        try:
+            with temporary.open("wb") as file:
+                torch.save(obj, file)
+        except RuntimeError as error:  # of the archive's end, which hides the error that broke it off
+            cause: BaseException | None = error
+            while cause is not None and not isinstance(cause, OSError | KeyboardInterrupt):
+                cause = cause.__context__
+            raise cause or error from None
 
 
 def load(path: str | Path) -> Any:
@@ -50,7 +57,7 @@ def load(path: str | Path) -> Any:
     except FileNotFoundError as error:
         raise CheckpointInvalid(path, "no such file") from error
     except OSError as error:
-        raise CheckpointInvalid(path, f"can't be read: {error.strerror or error}") from error
+        raise CheckpointInvalid(path, f"can't be read: {reason(error)}") from error
     except CheckpointInvalid:
         raise
     except Exception as error:  # a damaged pickle raises errors of any type

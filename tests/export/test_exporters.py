@@ -1,6 +1,7 @@
 """Files for other viewers hold the scene when read back, and keep the rules of their format."""
 
 import json
+import os
 import struct
 from dataclasses import replace
 from io import StringIO
@@ -34,7 +35,9 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
+from msdgs_serve.writing import WriteFailed
 from msdgs_train.gaussians.model_file import SceneInfo
+from tests.support.file_sizes import largest_file
 from tests.support.models import MLP, NODES, SCENE, random_model
 from tests.support.sound_scenes import OLDER
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
@@ -244,6 +247,26 @@ def test_a_failed_conversion_keeps_the_old_file(tmp_path: Path):
         run(scene, out, min_psnr=99.5)
     assert out.read_text() == "old"
     assert LOSSLESS > LOSSY >= 45
+
+
+SUFFIXES = (".ply", ".spz", ".glb", ".usdc", ".usda", ".onnx", ".visionary.onnx")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_on_a_full_disk_the_file_is_named_and_the_old_one_stays(tmp_path: Path, suffix: str):
+    scene, out = scene_file(tmp_path), tmp_path / f"out{suffix}"
+    out.write_bytes(b"old")
+    with pytest.raises(WriteFailed, match=f"^{out}: can't be written: "), largest_file(2000):
+        run(scene, out)
+    assert out.read_bytes() == b"old"
+    assert sorted(os.listdir(tmp_path)) == [out.name, scene.name]
+
+
+def test_on_a_full_disk_no_frame_of_a_sequence_stays(tmp_path: Path):
+    scene, out = scene_file(tmp_path), tmp_path / "frames"
+    with pytest.raises(WriteFailed, match=f"^{out}: can't be written: "), largest_file(2000):
+        run(scene, out, frames=2)
+    assert not os.listdir(out)
 
 
 @pytest.mark.parametrize("of", ["network", "sequence"])

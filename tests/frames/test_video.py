@@ -19,11 +19,13 @@ from av.video.reformatter import ColorRange
 from msdgs_serve import blocks, camera_path, render_cli
 from msdgs_serve.camera_path import CameraPath, read_nerfstudio
 from msdgs_serve.imaging import Image, encode
-from msdgs_serve.render_cli import INTERRUPTED, main
+from msdgs_serve.process import EXIT_INTERRUPTED
+from msdgs_serve.render_cli import main
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.threads import THREADS_VARIABLE
 from msdgs_serve.video import BT709, VIDEO_FORMATS, VideoFormat, write_video
+from tests.support.file_sizes import largest_file
 from tests.support.images import decode, psnr
 from tests.support.scene_files import level_camera
 from tests.support.service import check_problem, serving
@@ -295,6 +297,23 @@ def test_images_of_an_orbit(scene: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert "frame 3 of 3" in printed.err
 
 
+@pytest.mark.parametrize(
+    ("out", "size", "named"),
+    [("frames", 300, "frames"), ("orbit.mp4", 1500, "orbit.mp4"), ("frames", 60, "frames/msdgs-render.json")],
+)
+def test_on_a_full_disk_the_file_is_named_and_the_same_command_continues(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, size: int, named: str
+):
+    command = (scene, tmp_path / out, "--frames", 3, "--width", 20, "--height", 20)
+    with largest_file(size):
+        assert run(*command) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith(f"msdgs-render: {tmp_path / named}")
+    assert ": can't be written: a file may not be as large there" in error
+    assert not list(tmp_path.rglob(".msdgs-*"))
+    assert run(*command) == 0
+
+
 def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     video, drawn = tmp_path / "orbit.mp4", []
 
@@ -306,7 +325,7 @@ def test_a_stopped_command_resumes(scene: Path, tmp_path: Path, monkeypatch: pyt
 
     command = (scene, video, "--frames", 5, "--width", 16, "--height", 16, "--fps", 10)
     monkeypatch.setattr(blocks, "encode", encode_two)
-    assert run(*command) == INTERRUPTED
+    assert run(*command) == EXIT_INTERRUPTED
     assert not video.exists()
     monkeypatch.setattr(blocks, "encode", lambda image, *more: drawn.append(image.t) or encode(image, *more))
     assert run(*command) == 0
@@ -325,7 +344,7 @@ def test_a_frame_that_was_cut_off_is_named(
     command = (scene, tmp_path / "orbit.mp4", "--frames", 2, "--width", 64, "--height", 64)
     with monkeypatch.context() as stopped:
         stopped.setattr(render_cli, "write_video", stop)
-        assert run(*command) == INTERRUPTED
+        assert run(*command) == EXIT_INTERRUPTED
     frame = tmp_path / "orbit.mp4.frames" / "frame_00001.png"
     whole = frame.read_bytes()
     for size in (0, 50, len(whole) // 2):

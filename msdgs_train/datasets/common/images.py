@@ -6,7 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import OpenImageIO as oiio
 
+from msdgs_serve.files import scratch_file
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.writing import writing
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
@@ -81,15 +83,17 @@ def composite(rgba: np.ndarray, background: np.ndarray | tuple[float, float, flo
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write uint8 [H, W, 3 or 4], sRGB, straight alpha. Equal pixels give equal files. Raises `OSError`."""
+    """Write uint8 [H, W, 3 or 4], sRGB, straight alpha. Equal pixels give equal files. Raises `WriteFailed`."""
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, "uint8")
     spec.attribute("oiio:ColorSpace", "srgb_rec709_scene")
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    writer = oiio.ImageOutput.create(str(path))
-    written = writer is not None and writer.open(str(path), spec) and writer.write_image(pixels) and writer.close()
-    if not written:
-        raise OSError(f"{path}: can't be written: {writer.geterror() if writer else oiio.geterror()}")
+    writer = oiio.ImageOutput.create("png")
+    assert writer is not None
+    with writing(path), scratch_file() as (scratch, contents):  # the library doesn't notice a full disk
+        if not (writer.open(scratch, spec) and writer.write_image(pixels) and writer.close()):
+            raise ValueError(f"no PNG of {width} × {height} pixels: {writer.geterror()}")
+        path.write_bytes(contents())
 
 
 @kernel

@@ -45,6 +45,11 @@ class Frame:
     distortion: Distortion | None = None  # of the stored image; `load_rgba` removes it
     mask_path: Path | None = None  # an image of the stored image's size, black where pixels don't count
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that its pixels are read from."""
+        return (self.image_path,)
+
     def load_rgba(self) -> np.ndarray:
         """Read [height, width, 4] uint8, sRGB with straight alpha, undistorted and downscaled to the camera's size.
 

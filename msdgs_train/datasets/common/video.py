@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from msdgs_train.datasets.common.files import replacing
+from msdgs_serve.writing import reason, replacing
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame
 
@@ -60,6 +60,10 @@ class VideoFrame(Frame):
     video: Path
     index: int
     info: VideoInfo  # of the video
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        return (self.video,)
 
     def load_rgba(self) -> np.ndarray:
         """Read [height, width, 4] uint8, sRGB, opaque, of the camera's size. The first call decodes the video."""
@@ -148,7 +152,7 @@ def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
                 raise _invalid(video, problem)
     except OSError as error:
         gigabytes = 3e-9 * wanted.count * wanted.width * wanted.height
-        problem = f"can't be decoded into {file.parent}: {error.strerror}; it takes {gigabytes:.1f} GB. Set the "
+        problem = f"can't be decoded into {file.parent}: {reason(error)}. It takes {gigabytes:.1f} GB. Set the "
         problem += "environment variable XDG_CACHE_HOME to a folder with space, or train at a smaller size"
         raise _invalid(video, problem) from None
 

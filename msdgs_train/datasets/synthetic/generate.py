@@ -7,7 +7,6 @@ per time, each from another camera, or fixed cameras all see each time. The same
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.camera import OPENGL_TO_OPENCV, orbit
+from msdgs_serve.writing import temporary_folder
 from msdgs_train.datasets.common.images import composite, resize_area, write_png
 from msdgs_train.datasets.synthetic.rendering import render
 from msdgs_train.datasets.synthetic.trajectories import trajectories
@@ -165,8 +165,8 @@ def _replaced_when_complete(out: Path) -> Iterator[Path]:
         raise InvalidInput("out", "a new or empty folder, or a dataset made by this command", out)
     out = out.absolute()
     out.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=f".{out.name}.") as temporary:
-        new, old = Path(temporary, "new"), Path(temporary, "old")
+    with temporary_folder(out.parent, out) as temporary:
+        new, old = temporary / "new", temporary / "old"
         new.mkdir()
         yield new
         if out.exists():

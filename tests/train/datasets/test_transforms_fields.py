@@ -197,7 +197,8 @@ def test_each_file_of_a_layout_has_its_own_warning(tmp_path: Path):
     content = (tmp_path / "transforms_train.json").read_text()
     for split in ("val", "test"):
         (tmp_path / f"transforms_{split}.json").write_text(content)
-    assert [text.split(":")[0][-8:] for text in load_scene(tmp_path).warnings] == ["ain.json", "val.json", "est.json"]
+    named = [text for text in load_scene(tmp_path).warnings if "haze" in text]
+    assert [text.split(":")[0][-8:] for text in named] == ["ain.json", "val.json", "est.json"]
 
 
 @pytest.mark.parametrize("name", ["barrel", "pincushion", "tangential"])

@@ -1,6 +1,8 @@
 """`msdgs-train` as a program: help, errors, Ctrl-C and resuming."""
 
+import errno
 import json
+import os
 import signal
 import sys
 from pathlib import Path
@@ -8,11 +10,14 @@ from pathlib import Path
 import pytest
 import torch
 
+from msdgs_train.cli import fit_progress
 from msdgs_train.cli import main as cli
+from msdgs_train.cli.fit_progress import FitProgress
+from msdgs_train.engine.run import fit
 from msdgs_train.systems.registry import systems
 from tests.support.models import random_model, saved
 from tests.support.processes import program, wait_for
-from tests.support.training_scene import FEW
+from tests.support.training_scene import FEW, small_config
 
 pytestmark = pytest.mark.slow
 
@@ -118,20 +123,21 @@ def test_data_and_options_that_are_not_there_are_named(tmp_path: Path, capsys: p
     assert cli.main(command) == cli.EXIT_INVALID
     assert "does not exist" in capsys.readouterr().err.replace("\n", "")
     assert cli.main(["synthetic", "/dev/null/scene"]) == cli.EXIT_INVALID
-    assert "error: [Errno 17] File exists" in capsys.readouterr().err
+    assert "error: /dev/null: there is a file of this name already" in capsys.readouterr().err
     with pytest.raises(SystemExit) as exit_info:
         cli.main([*command, "--no-such-option"])
     assert exit_info.value.code == cli.EXIT_INVALID
     assert "--no-such-option" in capsys.readouterr().err
 
 
-def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_and_resumed(data: Path, tmp_path: Path, number: signal.Signals) -> None:
     """Ctrl-C finishes the step, saves, and prints the command to resume, which uses the run's settings."""
     run = tmp_path / "run"
     log = run / "metrics.jsonl"
     with program("msdgs_train.cli.main", "fit", data, run, "--steps=100000", *STATIONARY, *SMALL) as process:
         wait_for(lambda: process.poll() is not None or (log.exists() and log.read_text().count("\n") >= 3), 300)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         output = process.communicate(timeout=600)[0]
     assert process.returncode == cli.EXIT_INTERRUPTED, output
     assert "interrupted at step" in output
@@ -143,6 +149,29 @@ def test_interrupted_and_resumed(data: Path, tmp_path: Path) -> None:
     assert json.loads((run / "metrics.json").read_text())["step"] == step + 3
     assert json.loads((run / "config.json").read_text())["density"]["init_num_pts"] == 60
     assert cli.main([*more, "--ssim-lambda", "0.1"]) == cli.EXIT_INVALID
+
+
+class Unread:
+    """An output that is not read, as of a pager that has ended."""
+
+    encoding = "utf-8"
+
+    def write(self, text: str) -> int:
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+    def flush(self) -> None:
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
+
+
+def test_training_goes_on_if_its_output_is_not_read(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    progress = FitProgress(2)
+    monkeypatch.setattr(fit_progress.console, "file", Unread())
+    monkeypatch.setattr(fit_progress.console, "on_broken_pipe", lambda: sys.exit(1))  # its own closes the real output
+    with progress:
+        config = small_config(steps=2)
+        assert fit(config, data, tmp_path / "run", observer=progress).status == "finished"
 
 
 def test_synthetic_makes_what_fit_reads(tmp_path: Path) -> None:

@@ -152,7 +152,7 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("no_curve")
 def test_a_run_is_not_overwritten_and_keeps_its_settings(data: Path, tmp_path: Path) -> None:
     config, run = small_config(steps=2), tmp_path / "run"
-    with pytest.raises(InvalidInput, match="with a checkpoint"):
+    with pytest.raises(InvalidInput, match="to resume it"):
         fit(config, data, run, resume=True)
     fit(config, data, run)
     with pytest.raises(InvalidInput, match="--resume"):

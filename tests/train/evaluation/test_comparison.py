@@ -18,11 +18,14 @@ import pytest
 
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.cli import main as cli
+from msdgs_train.comparison import pools
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 from msdgs_train.comparison.pools import Processes, RunEnd, processes
 from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
 from msdgs_train.comparison.results import CurvePoint, Result
 from msdgs_train.comparison.runner import train_all
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.run import RunResult, fit
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.systems.registry import preset
 from tests.support.processes import ROOT, program, wait_for
@@ -230,16 +233,23 @@ def test_from_nothing_to_the_table_and_not_again(
 
 
 @pytest.mark.usefixtures("in_threads")
-def test_a_run_that_fails_is_reported_and_the_others_continue(systems_file: Path, tmp_path: Path) -> None:
+def test_a_run_that_fails_is_reported_and_the_others_continue(
+    systems_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails_once(config: TrainConfig, data: Path, run: Path, **options: Any) -> RunResult:
+        if data.name == "unevaluated" and config.run.system == "static":
+            raise ZeroDivisionError("of a plugin")
+        return fit(config, data, run, **options)
+
+    monkeypatch.setattr(pools, "fit", fails_once)
     ended: list[tuple[str, RunEnd]] = []
     (write_scene(tmp_path / "unevaluated", train=2, test=0) / "transforms_val.json").unlink()
-    (tmp_path / "out" / "static" / "unevaluated_0" / "config.json").mkdir(parents=True)
     scenes = [tmp_path / "nowhere", tmp_path / "unevaluated"]
     runs = make_runs(read_systems([str(systems_file)], BUDGET), scenes, [0], tmp_path / "out")
     assert train_all(runs, processes(1), lambda run, how: ended.append((run.system, how)))
     assert [system for system, _ in ended] == ["static", "k1", "k2 w=1"] * 2
     assert all(how.status == "failed" for _, how in ended)
-    messages = (*["nowhere"] * 3, "IsADirectoryError", *["held-out images"] * 2)
+    messages = (*["nowhere"] * 3, "ZeroDivisionError", *["held-out images"] * 2)
     assert all(message in how.message for message, (_, how) in zip(messages, ended, strict=True))
 
 
@@ -273,10 +283,13 @@ def begun(systems_file: Path, data: Path, out: Path) -> Iterator[subprocess.Pope
         yield process
 
 
-def test_ctrl_c_saves_and_the_same_command_goes_on(systems_file: Path, data: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_saves_and_the_same_command_goes_on(
+    systems_file: Path, data: Path, tmp_path: Path, number: signal.Signals
+) -> None:
     out = tmp_path / "out"
     with begun(systems_file, data, out) as process:
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         output = process.communicate(timeout=600)[0]
     assert process.returncode == cli.EXIT_INTERRUPTED, output
     assert "static, scene, seed 0: interrupted" in output
