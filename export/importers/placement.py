@@ -20,14 +20,14 @@ WITHIN = 0.9
 def far_offset(means: np.ndarray) -> np.ndarray | None:
     """[3] a round point in the middle of the centers, [N, 3] float64, if these are far from the origin, else None."""
     middle = np.median(means, axis=0)
-    reach = half_extent(means - middle)
+    reach = half_side(means - middle)
     if not np.abs(middle).max() > FAR * reach > 0:
         return None
     step = 10.0 ** np.floor(np.log10(reach))
     return np.round(middle / step) * step
 
 
-def half_extent(means: np.ndarray) -> float:
+def half_side(means: np.ndarray) -> float:
     """Half the largest extent of the centers, [N, 3]."""
     low, high = (np.quantile(means, part, axis=0) for part in ((1 - WITHIN) / 2, (1 + WITHIN) / 2))
     return float((high - low).max()) / 2
@@ -36,7 +36,7 @@ def half_extent(means: np.ndarray) -> float:
 def placement(frames: Sequence[Gaussians], offset: np.ndarray | None) -> Similarity:
     """From the frame that a scene of these Gaussians has in a file to that of the imported files, from which their
     centers are `offset` away."""
-    extent = max(half_extent(frame.means.astype(np.float64)) for frame in frames)
+    extent = max(half_side(frame.means.astype(np.float64)) for frame in frames)
     keeps = extent == 0 or KEPT_EXTENTS[0] <= extent <= KEPT_EXTENTS[1]
     scale = 1.0 if keeps else float(np.clip(float(f"{extent / EXTENT:.3g}"), MIN_SCALE, MAX_SCALE))
     x, y, z = (0.0, 0.0, 0.0) if offset is None else (float(v) for v in offset)

@@ -22,7 +22,7 @@ def foreign_file(start: bytes, name: str) -> str | None:
     if start.startswith(b"PK") and b"data.pkl" in start:
         return _to_import("a model", name)
     if start.startswith(b"PK"):
-        return f"{_to_import('a zip', name)} if it holds a splat"
+        return foreign_name(name) or f"{_to_import('a zip', name)} if it holds a splat"
     if start.startswith((b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b")):
         return _to_import("a splat", name)
     return foreign_name(name)

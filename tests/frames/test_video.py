@@ -396,7 +396,11 @@ def test_errors_are_one_line(
 
 
 @pytest.mark.parametrize(
-    ("out", "reason"), [("file", "file: File exists"), ("file/turn.mp4", "file/turn.mp4.frames: Not a directory")]
+    ("out", "reason"),
+    [
+        ("file", "file: there is a file of this name already"),
+        ("file/turn.mp4", "file/turn.mp4.frames: a part of the path is a file, not a folder"),
+    ],
 )
 def test_a_file_in_the_way_is_named(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: str, reason: str
