@@ -27,6 +27,8 @@ USAGE_ERROR = 2
 SEND_BUFFER = 1 << 17
 """Bytes of a response in the system's buffer. A larger one empties in steps that take a slow client longer than the
 time limit on reading, which then closes its connection although it reads."""
+LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+"""By an address that stands for all, the one on which this machine reaches itself."""
 SWITCH_SECONDS = 0.001
 """Switch interval of Python's interpreter. Under 4x overload the slowest accepted frames wait 0.7 times as long as with
 Python's default of 5 ms, and /live a quarter as long."""
@@ -119,13 +121,18 @@ class _AnnouncedServer(Server):
         if not names:
             print(f"{PROGRAM}: no .onnx files found; new files are served when they are added", file=sys.stderr)
         host, port = self._address
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host) or str(host)
-        url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-        print(f"Listening on {url} (Ctrl-C stops). API documentation: {url}/docs")
+        local = LOOPBACK.get(host, host)
+        everywhere = ", all addresses of this machine or container" if host in LOOPBACK else ""
+        url = _url(local, port)
+        print(f"Listening on {_url(host, port)}{everywhere} (Ctrl-C stops). API documentation: {url}/docs")
         for example in list(render_examples(self._store).values())[:1]:
             body = json.dumps(example["value"]).replace("'", "'\\''")
             print(f"Try:\n  curl {url}/render -H 'content-type: application/json' -o frame.png \\\n    -d '{body}'")
         sys.stdout.flush()
+
+
+def _url(host: str, port: int) -> str:
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def bind(host: str, port: int) -> socket.socket:
