@@ -37,7 +37,6 @@ from composition import (
     output,
     post,
     sh,
-    upload,
     video,
     wait_for,
 )
@@ -73,13 +72,15 @@ def main() -> int:
     print(f"Built in {time.perf_counter() - started:.0f} s")
     check_contents()
     check_cold_start()
+    with composition(1, MSDGS_FRAME_MAX_AGE="3600") as running:
+        check_start_message()
+        check_cache(running.url)
+        check_videos(running.url)
     for replicas in REPLICAS:
-        print(f"With {replicas} replicas:")
+        print(f"With {replicas} replica(s):")
         with composition(replicas) as running:
-            check_start_message()
-            check_cache(running.url)
+            check_revalidation(running.url)
             check_affinity(running.url, replicas)
-            check_videos(running.url)
             check_replicas(running, replicas)
     with tempfile.NamedTemporaryFile("w") as keys:
         keys.write("".join(f"{scope} {key}\n" for scope, key in KEYS.items()))
@@ -165,13 +166,13 @@ def check_rights(container: str, *writable: str) -> None:
 
 def check_start_message() -> None:
     """The log of a replica names the address on which it listens."""
-    for container in containers("render"):
-        printed = output(DOCKER, "logs", container).stdout
-        expect("Listening on http://0.0.0.0:8000" in printed, "a replica prints the address on which it listens")
+    (container,) = containers("render")
+    printed = output(DOCKER, "logs", container).stdout
+    expect("Listening on http://0.0.0.0:8000" in printed, "a replica prints the address on which it listens")
 
 
 def check_cache(url: str) -> None:
-    """A frame is rendered once, cached for a second, then revalidated by its ETag."""
+    """A frame is rendered once; it stays fresh for longer than this takes on a busy machine."""
     first = frame(url, 0.25)
     second = frame(url, 0.25)
     expect((first.headers["x-cache"], second.headers["x-cache"]) == ("MISS", "HIT"), "a frame is taken from the cache")
@@ -179,14 +180,19 @@ def check_cache(url: str) -> None:
     expect(["server-timing" in r.headers for r in (first, second)] == [True, False], "only rendered frames have times")
     known = frame(url, 0.25, headers={"If-None-Match": first.headers["etag"]})
     expect((known.status, known.body) == (304, b""), "a matching ETag gets a 304")
-    time.sleep(2.2)  # nginx counts whole seconds: one that lasts 1 s may be fresh for 2
-    expect(frame(url, 0.25).headers["x-cache"] == "REVALIDATED", "an expired frame is revalidated, not rendered again")
     keyed = frame(url, 0.25, headers={"X-API-Key": "some"})
     expect((keyed.status, keyed.headers["x-cache"]) == (200, "BYPASS"), "requests with a key bypass the cache")
     keyed = frame(url, 0.25, headers={"X-API-Key": "some", "If-None-Match": first.headers["etag"]})
     expect((keyed.status, keyed.body) == (304, b""), "their own ETags count")
     expect(get(f"{url}/metrics").status == 404, "metrics are not public")
     expect(get(f"{url}/").status == 200, "the viewer is served")
+
+
+def check_revalidation(url: str) -> None:
+    """A frame that is fresh for a second is then revalidated by its ETag."""
+    expect(frame(url, 0.25).headers["x-cache"] == "MISS", "a frame is rendered")
+    time.sleep(2.2)  # nginx counts whole seconds: one that lasts 1 s may be fresh for 2
+    expect(frame(url, 0.25).headers["x-cache"] == "REVALIDATED", "an expired frame is revalidated, not rendered again")
 
 
 def check_affinity(url: str, replicas: int) -> None:
@@ -263,6 +269,11 @@ def check_hostile_uploads(url: str) -> None:
     expect(sh(container, "find /tmp /uploads") == left, "no file is left")
     peak = sh(container, "cat /sys/fs/cgroup/memory.peak || cat /sys/fs/cgroup/memory/memory.max_usage_in_bytes")
     expect(int(peak) < MAX_MEMORY, f"peak memory of the container: {int(peak) / 1e6:.0f} MB")
+
+
+def upload(url: str, contents: bytes, headers: dict[str, str] = CAN_WRITE) -> int:
+    """Upload a scene as `sent`; returns the status."""
+    return ask(urllib.request.Request(f"{url}/scenes?name=sent", contents, headers, method="POST")).status
 
 
 if __name__ == "__main__":

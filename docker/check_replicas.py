@@ -1,19 +1,20 @@
 """Checks for docker/check.py: no request is lost while replicas come, go or hang."""
 
 import itertools
+import re
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
-from composition import DOCKER, Composition, Response, containers, expect, frame, get, log, output, post
+from composition import DOCKER, ROOT, Composition, Response, containers, expect, frame, get, log, output, post
 
 CLIENTS = 4
 SETTLED_SECONDS = 3.0
 """How long clients go on after a change: longer than the proxy takes to notice one."""
-READ_SECONDS = 35.0
-"""How long the proxy waits for a replica, as in nginx.conf."""
+READ_SECONDS = float(re.findall(r"proxy_read_timeout (\d+)s", (ROOT / "docker/nginx/nginx.conf").read_text())[0])
+"""How long the proxy waits for a replica."""
 
 
 class Load(NamedTuple):

@@ -95,11 +95,6 @@ def frame(
     return get(link, headers)
 
 
-def upload(url: str, contents: bytes, headers: dict[str, str] = CAN_WRITE) -> int:
-    """Upload a scene as `sent`; returns the status."""
-    return ask(urllib.request.Request(f"{url}/scenes?name=sent", contents, headers, method="POST")).status
-
-
 def post(url: str, t: float, azimuth: int, request_id: str) -> Response:
     """Request a frame by POST."""
     camera = {"type": "orbit", "azimuth": azimuth, "elevation": 20}

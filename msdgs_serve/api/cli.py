@@ -109,7 +109,7 @@ class _AnnouncedServer(Server):
     def __init__(self, app: object, settings: Settings, store: SceneStore, listener: socket.socket) -> None:
         super().__init__(app, settings)  # pyright: ignore[reportArgumentType]
         self._store = store
-        self._address = listener.getsockname()[:2]
+        self._address: tuple[str, int] = listener.getsockname()[:2]
 
     def on_ready(self) -> None:
         # objects of the startup are permanent: scanning them in each garbage collection makes the slowest frames under

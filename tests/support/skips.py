@@ -32,6 +32,7 @@ class Lack(NamedTuple):
 LACKS = (
     Lack("no Chromium on this machine", "the page in a browser", debian="chromium libatomic1"),
     Lack("there is no prometheus to run", "the dashboard's queries", debian="prometheus"),
+    Lack("there is no nginx to run", "the proxy", debian="nginx-light"),
     Lack("needs strace", "which files native code opens", debian="strace"),
     Lack("kubernetes-validate isn't installed", "the Kubernetes manifests", python="kubernetes-validate"),
     Lack("no tests/export/node/node_modules", "written files in other programs", make="tests/export/node/node_modules"),
