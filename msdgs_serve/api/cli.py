@@ -120,19 +120,19 @@ class _AnnouncedServer(Server):
         print(f"{len(names)} scene(s) after {self.service.start_seconds:.1f} s: {', '.join(names[:20])}", flush=True)
         if not names:
             print(f"{PROGRAM}: no .onnx files found; new files are served when they are added", file=sys.stderr)
-        host, port = self._address
-        local = LOOPBACK.get(host, host)
-        everywhere = ", all addresses of this machine or container" if host in LOOPBACK else ""
-        url = _url(local, port)
-        print(f"Listening on {_url(host, port)}{everywhere} (Ctrl-C stops). API documentation: {url}/docs")
+        listening, url = addresses(*self._address)
+        everywhere = "" if listening == url else ", all addresses of this machine or container"
+        print(f"Listening on {listening}{everywhere} (Ctrl-C stops). API documentation: {url}/docs")
         for example in list(render_examples(self._store).values())[:1]:
             body = json.dumps(example["value"]).replace("'", "'\\''")
             print(f"Try:\n  curl {url}/render -H 'content-type: application/json' -o frame.png \\\n    -d '{body}'")
         sys.stdout.flush()
 
 
-def _url(host: str, port: int) -> str:
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+def addresses(host: str, port: int) -> tuple[str, str]:
+    """Return the URL of the address that is listened on, and the URL by which this machine reaches it."""
+    listening, local = (f"[{each}]" if ":" in each else each for each in (host, LOOPBACK.get(host, host)))
+    return f"http://{listening}:{port}", f"http://{local}:{port}"
 
 
 def bind(host: str, port: int) -> socket.socket:
