@@ -38,6 +38,7 @@ class Handler(BaseHTTPRequestHandler):
     """Reads a request and lets the server answer."""
 
     protocol_version = "HTTP/1.1"
+    wbufsize = 1 << 16  # head and body are sent together, or the second waits 40 ms for the first to be acknowledged
     server: Server  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def do_GET(self) -> None:
