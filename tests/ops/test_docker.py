@@ -112,12 +112,12 @@ def test_the_service_trusts_the_address_from_the_proxy():
 
 def test_the_proxys_limits_follow_those_of_the_service():
     settings, limits = (DOCKER / "nginx" / "nginx.conf").read_text(), Settings.model_fields
-    seconds = [float(each) for each in re.findall(r"proxy_read_timeout (\d+)s;", settings)]
-    assert limits["render_seconds"].default < seconds[0] < 2 * limits["render_seconds"].default
+    (seconds,) = map(float, re.findall(r"^    proxy_read_timeout (\d+)s;", settings, re.MULTILINE))
+    assert limits["render_seconds"].default < seconds < 2 * limits["render_seconds"].default
     assert f"client_max_body_size {limits['max_body_bytes'].default >> 20}m;" in settings
     (idle,) = {float(each) for each in re.findall(r"keepalive_timeout (\d+)s;", settings)}
     assert idle < Config("").timeout_keep_alive, "nginx closes idle connections, not the service during a request"
-    assert seconds_of(SERVICES["proxy"]["stop_grace_period"]) > seconds[0]
+    assert seconds_of(SERVICES["proxy"]["stop_grace_period"]) > seconds
     assert seconds_of(SERVICES["render"]["stop_grace_period"]) > limits["drain_seconds"].default
 
 

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from msdgs_serve.api.settings import Settings
-from tests.support.nginx import Handler, Proxy, Replica, Server, needs_nginx, proxying, running_nginx
+from tests.support.nginx import READ_SECONDS, Handler, Proxy, Replica, Server, needs_nginx, proxying, running_nginx
 from tests.support.processes import wait_for
 
 pytestmark = needs_nginx
@@ -91,6 +91,30 @@ def test_a_full_replica_is_not_left_out(tmp_path: Path):
         response = proxy.client.post("/render", json={"t": 0})
         assert (response.status_code, response.headers["retry-after"]) == (503, "7")
         assert response.json()["detail"] == "from a replica"
+
+
+def test_replicas_that_were_left_out_are_asked_if_there_is_no_other(tmp_path: Path):
+    with proxying(tmp_path, 0, 0) as proxy:
+        assert frames(proxy.client, 4) == [503] * 4
+        for replica in proxy.replicas:
+            replica.status = 200
+        assert proxy.client.get("/ready").status_code == 200
+        assert frames(proxy.client, 4) == [200] * 4
+
+
+@pytest.mark.slow
+def test_a_video_may_pause_for_longer_than_a_frame_takes(tmp_path: Path):
+    with proxying(tmp_path, 503, 200) as proxy:
+        full, sound = proxy.replicas
+        t = 0
+        while not full.asked:
+            t += 1
+            assert proxy.client.post("/render", json={"t": t}).status_code == 200
+        sound.pause = 1.5 * READ_SECONDS
+        for each in (t, t - 1):  # the first is asked of the full replica before
+            response = proxy.client.post("/render/video", json={"t": each})
+            assert (response.status_code, response.json()["status"]) == (200, 200)
+        assert len(full.asked) > 1
 
 
 @pytest.mark.parametrize("path", ["/render", "/render?t=0.5", "/render/video"])

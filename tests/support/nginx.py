@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -21,7 +22,7 @@ from tests.support.processes import ROOT, free_port, wait_for
 
 SETTINGS = ROOT / "docker" / "nginx"
 READ_SECONDS = 1
-"""How long nginx waits for a replica in tests."""
+"""How long nginx waits for a frame in tests."""
 
 needs_nginx = pytest.mark.skipif(shutil.which("nginx") is None, reason="there is no nginx to run")
 
@@ -51,14 +52,17 @@ class Handler(BaseHTTPRequestHandler):
     def log_message(self, format: str, *args: object) -> None:
         """Print nothing."""
 
-    def send(self, status: int, body: bytes = b"{}") -> None:
-        """Send a response with JSON."""
+    def send(self, status: int, body: bytes, pause: float) -> None:
+        """Send a response with JSON, with a pause after its head."""
         self.send_response(status)
         for name, value in {"Content-Type": "application/problem+json", "Content-Length": str(len(body))}.items():
             self.send_header(name, value)
         if status == 503:
             self.send_header("Retry-After", "7")
         self.end_headers()
+        if pause:
+            self.wfile.flush()
+            time.sleep(pause)
         self.wfile.write(b"" if self.command == "HEAD" else body)
 
 
@@ -67,6 +71,7 @@ class Replica:
     """A replica that answers with a status, closes the connection (0) or hangs (None); it notes the requests."""
 
     status: int | None = 200
+    pause: float = 0.0
     asked: list[str] = field(default_factory=list)
     released: threading.Event = field(default_factory=threading.Event)
 
@@ -74,7 +79,9 @@ class Replica:
         """Answer as `status` says."""
         self.asked.append(f"{request.command} {request.path}")
         if self.status:
-            request.send(self.status, json.dumps({"status": self.status, "detail": "from a replica"}).encode())
+            request.send(
+                self.status, json.dumps({"status": self.status, "detail": "from a replica"}).encode(), self.pause
+            )
         else:
             request.close_connection = True
             if self.status is None:
@@ -128,7 +135,7 @@ def running_nginx(folder: Path, ports: list[int]) -> Iterator[httpx.Client]:
         r" /dev/stdout": f" {folder}/access.log",
         r"worker_processes auto": "worker_processes 1",
         r"listen 8080": f"listen 127.0.0.1:{port}",
-        r"proxy_read_timeout \d+s": f"proxy_read_timeout {READ_SECONDS}s",
+        r"(?m)^    proxy_read_timeout \d+s": f"    proxy_read_timeout {READ_SECONDS}s",
     }
     settings = (SETTINGS / "nginx.conf").read_text()
     for pattern, value in changes.items():
