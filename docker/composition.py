@@ -20,6 +20,8 @@ IMAGE = os.environ.get("MSDGS_IMAGE", "msdgs:check")
 BASE_IMAGE = os.environ.get("BASE_IMAGE", "python:3.11-slim-bookworm")
 PROXY_IMAGE = os.environ.get("PROXY_IMAGE", "nginx:1.28-alpine")
 PROJECT = "msdgs-check"
+LEFT_OUT_SECONDS = 11.0
+"""How long the proxy may still leave out replicas that were starting; more than `fail_timeout` in replicas.conf."""
 MAX_START_SECONDS = 120.0
 """Maximum seconds until a service is ready, also on a busy machine."""
 
@@ -76,6 +78,7 @@ def composition(replicas: int, **settings: str) -> Iterator[Composition]:
     started = Composition(**settings)
     try:
         started.scale(replicas)
+        time.sleep(LEFT_OUT_SECONDS)
         yield started
     finally:
         started.remove()

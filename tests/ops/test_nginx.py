@@ -93,6 +93,16 @@ def test_a_full_replica_is_not_left_out(tmp_path: Path):
         assert response.json()["detail"] == "from a replica"
 
 
+@pytest.mark.parametrize("status", [0, 503])
+def test_frames_of_other_replicas_are_cached_too(tmp_path: Path, status: int):
+    with proxying(tmp_path, status, 200) as proxy:
+        for number in range(8):
+            seen = [proxy.client.get(f"/render?t={number}").headers["x-cache"] for _ in range(2)]
+            assert seen == ["MISS", "HIT"]
+        assert len(proxy.replicas[1].asked) == 8
+        assert proxy.replicas[0].asked
+
+
 def test_replicas_that_were_left_out_are_asked_if_there_is_no_other(tmp_path: Path):
     with proxying(tmp_path, 0, 0) as proxy:
         assert frames(proxy.client, 4) == [503] * 4

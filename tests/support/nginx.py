@@ -55,8 +55,10 @@ class Handler(BaseHTTPRequestHandler):
     def send(self, status: int, body: bytes, pause: float) -> None:
         """Send a response with JSON, with a pause after its head."""
         self.send_response(status)
-        for name, value in {"Content-Type": "application/problem+json", "Content-Length": str(len(body))}.items():
-            self.send_header(name, value)
+        self.send_header("Content-Type", "application/problem+json")
+        self.send_header("Content-Length", str(len(body)))
+        if status == 200:
+            self.send_header("Cache-Control", "public, max-age=3600")
         if status == 503:
             self.send_header("Retry-After", "7")
         self.end_headers()
