@@ -27,6 +27,8 @@ USAGE_ERROR = 2
 SEND_BUFFER = 1 << 17
 """Bytes of a response in the system's buffer. A larger one empties in steps that take a slow client longer than the
 time limit on reading, which then closes its connection although it reads."""
+LOOPBACK = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+"""By an address that stands for all, the one on which this machine reaches itself."""
 SWITCH_SECONDS = 0.001
 """Switch interval of Python's interpreter. Under 4x overload the slowest accepted frames wait 0.7 times as long as with
 Python's default of 5 ms, and /live a quarter as long."""
@@ -107,7 +109,7 @@ class _AnnouncedServer(Server):
     def __init__(self, app: object, settings: Settings, store: SceneStore, listener: socket.socket) -> None:
         super().__init__(app, settings)  # pyright: ignore[reportArgumentType]
         self._store = store
-        self._address = listener.getsockname()[:2]
+        self._address: tuple[str, int] = listener.getsockname()[:2]
 
     def on_ready(self) -> None:
         # objects of the startup are permanent: scanning them in each garbage collection makes the slowest frames under
@@ -118,14 +120,19 @@ class _AnnouncedServer(Server):
         print(f"{len(names)} scene(s) after {self.service.start_seconds:.1f} s: {', '.join(names[:20])}", flush=True)
         if not names:
             print(f"{PROGRAM}: no .onnx files found; new files are served when they are added", file=sys.stderr)
-        host, port = self._address
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host) or str(host)
-        url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-        print(f"Listening on {url} (Ctrl-C stops). API documentation: {url}/docs")
+        listening, url = addresses(*self._address)
+        everywhere = "" if listening == url else ", all addresses of this machine or container"
+        print(f"Listening on {listening}{everywhere} (Ctrl-C stops). API documentation: {url}/docs")
         for example in list(render_examples(self._store).values())[:1]:
             body = json.dumps(example["value"]).replace("'", "'\\''")
             print(f"Try:\n  curl {url}/render -H 'content-type: application/json' -o frame.png \\\n    -d '{body}'")
         sys.stdout.flush()
+
+
+def addresses(host: str, port: int) -> tuple[str, str]:
+    """Return the URL of the address that is listened on, and the URL by which this machine reaches it."""
+    listening, local = (f"[{each}]" if ":" in each else each for each in (host, LOOPBACK.get(host, host)))
+    return f"http://{listening}:{port}", f"http://{local}:{port}"
 
 
 def bind(host: str, port: int) -> socket.socket:

@@ -17,6 +17,7 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from uvicorn import Config
 
 from msdgs_serve.api.keys import MIN_KEY_LENGTH
 from msdgs_serve.api.settings import Settings
@@ -49,7 +50,7 @@ def test_every_requirement_is_a_tested_version_with_hashes(name: str):
     assert all("--hash=sha256:" in block for block in blocks)
 
 
-@pytest.mark.parametrize(("name", "extras"), [("serve", ()), ("train", ("train", "export"))])
+@pytest.mark.parametrize(("name", "extras"), [("serve", ("video",)), ("train", ("train", "export"))])
 def test_everything_that_the_package_asks_for_is_locked(name: str, extras: tuple[str, ...]):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     asked = [*project["dependencies"], *(d for extra in extras for d in project["optional-dependencies"][extra])]
@@ -57,8 +58,9 @@ def test_everything_that_the_package_asks_for_is_locked(name: str, extras: tuple
     assert names - pins(DOCKER / "requirements" / f"{name}.txt").keys() <= {"torch"}, "docker/lock.sh renews them"
 
 
-def test_the_serve_image_has_no_torch():
+def test_the_serve_image_has_no_torch_and_renders_videos():
     assert not {"torch", "onnx", "scipy", "matplotlib"} & pins(DOCKER / "requirements" / "serve.txt").keys()
+    assert "av" in pins(DOCKER / "requirements" / "serve.txt")
     assert "torch" not in pins(DOCKER / "requirements" / "train.txt"), "it comes from another index"
 
 
@@ -106,6 +108,31 @@ def test_the_service_trusts_the_address_from_the_proxy():
     render = SERVICES["render"]
     assert render["environment"]["MSDGS_PROXIES"] == "*"
     assert "ports" not in render, "every client would be trusted"
+
+
+def test_the_proxys_limits_follow_those_of_the_service():
+    settings, limits = (DOCKER / "nginx" / "nginx.conf").read_text(), Settings.model_fields
+    (seconds,) = map(float, re.findall(r"^    proxy_read_timeout (\d+)s;", settings, re.MULTILINE))
+    assert limits["render_seconds"].default < seconds < 2 * limits["render_seconds"].default
+    assert f"client_max_body_size {limits['max_body_bytes'].default >> 20}m;" in settings
+    (idle,) = {float(each) for each in re.findall(r"keepalive_timeout (\d+)s;", settings)}
+    assert idle < Config("").timeout_keep_alive, "nginx closes idle connections, not the service during a request"
+    assert seconds_of(SERVICES["proxy"]["stop_grace_period"]) > seconds
+    assert seconds_of(SERVICES["render"]["stop_grace_period"]) > limits["drain_seconds"].default
+
+
+def test_the_build_gets_its_arguments_certificates_and_network():
+    build = SERVICES["render"]["build"]
+    stated = set(re.findall(r"^ARG (\w+)=", (DOCKER / "Dockerfile").read_text(), re.MULTILINE))
+    assert build["args"].keys() == stated
+    mounted = set(re.findall(r"--mount=type=secret,id=(\w+)", (DOCKER / "Dockerfile").read_text()))
+    assert set(build["secrets"]) == mounted
+    assert COMPOSITION["secrets"]["ca"]["file"] == "${CA_FILE:-/dev/null}", "optional"
+    assert build["network"] == "${BUILD_NETWORK:-default}", "optional"
+
+
+def seconds_of(duration: str) -> float:
+    return float(duration.removesuffix("s"))
 
 
 def test_all_settings_of_the_service_exist():

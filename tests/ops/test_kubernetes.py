@@ -1,5 +1,6 @@
 """The manifest for Kubernetes is valid and consistent with the service."""
 
+import re
 from typing import Any
 
 import pytest
@@ -84,8 +85,10 @@ def test_the_proxy_finds_its_settings():
         "msdgs-nginx",
         found("ConfigMap", "msdgs-replicas")["metadata"]["name"],
     ]
-    assert "include replicas.conf;" in (ROOT / "docker" / "nginx" / "nginx.conf").read_text()
-    assert (
-        f"server {found('Service', 'msdgs-render')['metadata']['name']}.default."
-        in (found("ConfigMap", "msdgs-replicas")["data"]["replicas.conf"])
-    )
+    nginx, lists = ROOT / "docker" / "nginx", found("ConfigMap", "msdgs-replicas")["data"]
+    included = re.findall(r"include (\S+);", (nginx / "nginx.conf").read_text())
+    assert sorted(included) == sorted(lists)
+    host = f"{found('Service', 'msdgs-render')['metadata']['name']}.default.svc.cluster.local"
+    for name in included:
+        (server,) = re.findall(r"^server .*", (nginx / name).read_text(), re.MULTILINE)
+        assert server.replace("render:", f"{host}:") in lists[name], "the same server with the same parameters"

@@ -13,5 +13,5 @@ def test_one_line_names_untested_parts_and_the_command_to_install_them():
     assert not_tested(list(ALLOWED_SKIPS)) == ""
     line = not_tested([lack.reason for lack in (*LACKS, LACKS[0])])
     assert "the page in a browser (2), " in line
-    install = "apt-get install chromium libatomic1 nginx prometheus strace && pip install kubernetes-validate"
+    install = "apt-get install chromium libatomic1 nginx-light prometheus strace && pip install kubernetes-validate"
     assert line.endswith(f"{install} && make tests/export/node/node_modules")

@@ -1,5 +1,6 @@
 """The command `msdgs-serve`: its output, its first frame, its exit status."""
 
+import os
 import re
 import shlex
 import signal
@@ -12,7 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from msdgs_serve.api.cli import main
+from msdgs_serve.api.cli import addresses, main
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.threads import THREADS_VARIABLE
 from tests.support.images import decode
@@ -65,6 +66,35 @@ def test_it_prints_its_address_and_an_example_and_stops_at_ctrl_c(process: subpr
         process.send_signal(number)
     out, err = process.communicate(timeout=600)
     assert (process.returncode, out.strip(), err) == (0, "Stopped.", "")
+
+
+@pytest.mark.parametrize(
+    ("host", "listening", "local"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:80", "http://127.0.0.1:80"),
+        ("192.168.0.7", "http://192.168.0.7:80", "http://192.168.0.7:80"),
+        ("0.0.0.0", "http://0.0.0.0:80", "http://127.0.0.1:80"),
+        ("::", "http://[::]:80", "http://[::1]:80"),
+        ("fe80::1", "http://[fe80::1]:80", "http://[fe80::1]:80"),
+    ],
+)
+def test_the_address_that_it_listens_on_isnt_the_one_to_call(host: str, listening: str, local: str):
+    assert addresses(host, 80) == (listening, local)
+
+
+def test_in_a_container_it_prints_that_it_listens_everywhere(scene: Path):
+    environment = {**os.environ, "MSDGS_HOST": "0.0.0.0"}
+    with subprocess.Popen(
+        [*COMMAND, str(scene), "--port", "0"], stdout=subprocess.PIPE, env=environment, text=True
+    ) as process:
+        try:
+            printed = read_until(process, r"curl")
+        finally:
+            process.kill()
+    match = re.search(r"Listening on http://0\.0\.0\.0:(\d+), all addresses of this machine or container", printed)
+    assert match
+    assert f"http://127.0.0.1:{match[1]}/docs" in printed
+    assert f"curl http://127.0.0.1:{match[1]}/render" in printed
 
 
 def test_help_shows_examples_and_options(capsys: pytest.CaptureFixture[str]):

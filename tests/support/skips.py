@@ -31,7 +31,7 @@ class Lack(NamedTuple):
 
 LACKS = (
     Lack("no Chromium on this machine", "the page in a browser", debian="chromium libatomic1"),
-    Lack("there is no nginx to run", "the service behind a proxy", debian="nginx"),
+    Lack("there is no nginx to run", "the service behind a proxy", debian="nginx-light"),
     Lack("there is no prometheus to run", "the dashboard's queries", debian="prometheus"),
     Lack("needs strace", "which files native code opens", debian="strace"),
     Lack("kubernetes-validate isn't installed", "the Kubernetes manifests", python="kubernetes-validate"),
