@@ -74,6 +74,11 @@ class SceneMetadata:
     eps2d: float = 0.3  # px², as trained
     duration: float | None = None  # of the time range, seconds; None: unknown
 
+    @property
+    def is_switched(self) -> bool:
+        """Whether the scene switches from stored frame to frame, so that no Gaussian moves."""
+        return self.plan.startswith("frames:")
+
     def to_properties(self) -> dict[str, str]:
         """Return the `metadata_props` of a file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}

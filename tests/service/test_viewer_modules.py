@@ -106,14 +106,14 @@ def test_motion_ends_within_the_range_of_times(modules: Page, first: float, last
 @pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
 def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nanoseconds_per_pixel: float):
     script = """async ([pose, aPixel]) => {
-        const { Pace } = await import("/viewer/pace.js");
+        const { MOVING, Pace } = await import("/viewer/pace.js");
         const pace = new Pace();
         const taken = [];
         for (let i = 0; i < 20; i += 1) {
-          const { width, height } = pace.size({ width: 1600, height: 1200 });
+          const { width, height } = pace.size({ width: 1600, height: 1200 }, MOVING);
           const drawing = width * height * aPixel;
           taken.push([width * height, pose + drawing]);
-          pace.measured(width * height, pose + drawing, drawing);
+          pace.measured(width * height, { seconds: pose + drawing, drawing });
         }
         return taken; }"""
     taken = modules.evaluate(script, [pose, nanoseconds_per_pixel * 1e-9])
@@ -142,6 +142,7 @@ def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: floa
           size: () => ({ width: 1200, height: 800 }),
           body: () => ({}),
           isMoving: () => true,
+          isPlaying: () => false,
           show: (_, { seconds }) => taken.push(seconds),
         };
         const frames = new Frames(host, new Pace());
