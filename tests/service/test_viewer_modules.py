@@ -186,7 +186,6 @@ def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modul
     last = page.evaluate("asked.at(-1)[1]")
     assert (last["format"], last["t"]) == ("png", page.evaluate("t")), "the exact frame"
     assert page.evaluate("shown.at(-1)[0]") is True
-    page.close()
 
 
 def test_a_frame_that_was_overtaken_is_not_shown(modules: Page):
@@ -222,7 +221,6 @@ def test_a_frame_that_was_overtaken_is_not_shown(modules: Page):
     page = modules.context.new_page()
     page.goto(modules.url)
     assert page.evaluate(script) == [2]
-    page.close()
 
 
 def test_the_larger_of_two_in_flight_fits_the_service(modules: Page):

@@ -80,7 +80,7 @@ COMPACT = DYNAMIC | {"plan": "compact:50", "measured_error": {"means": 3.2e-4}, 
 
 
 @pytest.mark.parametrize(
-    ("scene", "facts"),
+    ("described", "facts"),
     [
         (STATIC, ["Gaussians 1,234,567", "Deformation none, the scene is static", "Error none"]),
         (
@@ -118,13 +118,13 @@ COMPACT = DYNAMIC | {"plan": "compact:50", "measured_error": {"means": 3.2e-4}, 
         ),
     ],
 )
-def test_the_facts_of_each_kind_of_scene(modules: Page, scene: dict[str, Any], facts: list[str]):
+def test_the_facts_of_each_kind_of_scene(modules: Page, described: dict[str, Any], facts: list[str]):
     script = """async (scene) => {
         const { showFacts } = await import("/viewer/facts.js");
         const list = document.createElement("dl");
         showFacts(list, scene);
         return [...list.children].map((each) => (each.tagName === "dt" ? "|" : "") + each.textContent).join(" "); }"""
-    texts = modules.evaluate(script, scene)
+    texts = modules.evaluate(script, described)
     for fact in [*facts, "SHA-256 0123456789ab"]:
         assert fact in texts.replace("|", ""), texts
     terms = [fact.split()[0] for fact in facts if not fact.startswith("motion")]
