@@ -110,7 +110,9 @@ def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nano
 
 
 @pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.0, 2500.0), (0.0, 100_000.0), (0.6, 20.0)])
-def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: float, nanoseconds_per_pixel: float):
+def test_slow_moving_frames_become_small_and_are_shown(
+    modules: Page, page: Page, pose: float, nanoseconds_per_pixel: float
+):
     """The clock is simulated: at first a frame of 600 x 400 pixels takes at least 0.6 s."""
     script = """async ([pose, aPixel]) => {
         const { Frames } = await import("/viewer/frames.js");
@@ -135,7 +137,6 @@ def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: floa
         frames.paused = false;
         const tick = () => (frames.change(), requestAnimationFrame(tick));
         tick(); }"""
-    page = modules.context.new_page()
     page.clock.install(time=0)
     page.goto(modules.url)
     page.clock.pause_at(1000)
@@ -147,7 +148,7 @@ def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: floa
     assert sum(taken) > 8, "hardly a frame came after the first ones"
 
 
-def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modules: Page):
+def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modules: Page, page: Page):
     """The clock is simulated: a frame takes 20 ms on the service and 30 ms on its way."""
     script = """async () => {
         const { Frames } = await import("/viewer/frames.js");
@@ -172,7 +173,6 @@ def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modul
         frames.paused = false;
         const tick = () => (playing && ((t += 1), frames.change()), requestAnimationFrame(tick));
         tick(); }"""
-    page = modules.context.new_page()
     page.clock.install(time=0)
     page.goto(modules.url)
     page.clock.pause_at(1000)
@@ -188,7 +188,7 @@ def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modul
     assert page.evaluate("shown.at(-1)[0]") is True
 
 
-def test_a_frame_that_was_overtaken_is_not_shown(modules: Page):
+def test_a_frame_that_was_overtaken_is_not_shown(modules: Page, page: Page):
     script = """async () => {
         const { Frames } = await import("/viewer/frames.js");
         const { Pace } = await import("/viewer/pace.js");
@@ -218,7 +218,6 @@ def test_a_frame_that_was_overtaken_is_not_shown(modules: Page):
         answers[0]();
         await drawn();
         return shown; }"""
-    page = modules.context.new_page()
     page.goto(modules.url)
     assert page.evaluate(script) == [2]
 
