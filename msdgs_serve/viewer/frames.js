@@ -2,11 +2,11 @@
 // A full frame in progress is aborted when something moves, and the service cancels its render.
 
 import { Refusal, received, render } from "./api.js";
-import { MOVING, PLAYING } from "./pace.js";
 
 const FULL_AFTER = 150; // milliseconds
 const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
 const MIN_PIXELS = 64 * 64;
+const MOST_REQUESTS = 2; // in flight during playback: the next one hides the way to the service
 
 export class Frames {
   /**
@@ -76,11 +76,10 @@ export class Frames {
 
   #askMoving() {
     const isPlaying = this.host.isPlaying();
-    const rhythm = isPlaying ? PLAYING : MOVING;
-    if (this.inFlight.size >= rhythm.requests) return;
+    if (this.inFlight.size >= (isPlaying ? MOST_REQUESTS : 1)) return;
     if (isPlaying && !this.pace.takesTurn(performance.now() / 1000)) return; // the next tick of playback asks again
     this.wanted = false;
-    this.#fetch({ full: false, size: this.pace.size(this.fullSize(), rhythm) });
+    this.#fetch({ full: false, size: this.pace.size(this.fullSize()) });
   }
 
   #askFull() {
@@ -118,8 +117,8 @@ export class Frames {
     this.drawn = number;
     const seconds = (performance.now() - at) / 1000;
     const stages = timings(response.headers.get("Server-Timing"));
-    const { queue = 0, pose = 0, draw = 0, encode = 0 } = stages;
-    if (!full) this.pace.measured(pixels, { seconds: seconds - queue, drawing: draw + encode, posing: pose });
+    const { queue = 0, draw = 0, encode = 0 } = stages;
+    if (!full) this.pace.measured(pixels, seconds - queue, draw + encode);
     this.host.show(bitmap, { ...size, full, seconds, stages, isNews });
     bitmap.close();
     this.refused = false;

@@ -204,8 +204,7 @@ function command(key) {
 }
 
 function setView(view) {
-  if (!views.show(view)) return;
-  notice("");
+  notice(views.show(view) ? "" : noView(view));
   frames.change({ cut: true });
 }
 

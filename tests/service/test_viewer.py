@@ -167,8 +167,7 @@ def test_it_plays_with_one_request_ahead(opened: Page):
     wait_for(lambda: opened.wait_for_timeout(100) or (len({body["t"] for body in asked}) > 5 and began_again(asked)))
     opened.get_by_role("button", name="Pause").click()
     wait_until_still(opened)
-    spans = opened.evaluate(RENDER_TIMES)
-    assert len(spans) > 5
+    assert len(spans := opened.evaluate(RENDER_TIMES)) > 5
     assert all(answered <= start for (_, answered), (start, _) in zip(spans, spans[2:], strict=False))
     shown = float(opened.locator("#time-text").inner_text().removeprefix("t "))
     assert shown == pytest.approx(asked[-1]["t"], abs=0.00051)

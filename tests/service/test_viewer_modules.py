@@ -92,14 +92,14 @@ def test_motion_ends_within_the_range_of_times(modules: Page, first: float, last
 @pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
 def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nanoseconds_per_pixel: float):
     script = """async ([pose, aPixel]) => {
-        const { MOVING, Pace } = await import("/viewer/pace.js");
+        const { Pace } = await import("/viewer/pace.js");
         const pace = new Pace();
         const taken = [];
         for (let i = 0; i < 20; i += 1) {
-          const { width, height } = pace.size({ width: 1600, height: 1200 }, MOVING);
+          const { width, height } = pace.size({ width: 1600, height: 1200 });
           const drawing = width * height * aPixel;
           taken.push([width * height, pose + drawing]);
-          pace.measured(width * height, { seconds: pose + drawing, drawing });
+          pace.measured(width * height, pose + drawing, drawing);
         }
         return taken; }"""
     taken = modules.evaluate(script, [pose, nanoseconds_per_pixel * 1e-9])
@@ -220,20 +220,6 @@ def test_a_frame_that_was_overtaken_is_not_shown(modules: Page, page: Page):
         return shown; }"""
     page.goto(modules.url)
     assert page.evaluate(script) == [2]
-
-
-def test_the_larger_of_two_in_flight_fits_the_service(modules: Page):
-    """With a request ahead, the way to the service costs no pixels; without one, it does."""
-    script = """async () => {
-        const { MOVING, Pace, PLAYING } = await import("/viewer/pace.js");
-        const pace = new Pace();
-        const full = { width: 1600, height: 1200 };
-        pace.measured(1e6, { seconds: 0.045, drawing: 0.02, posing: 0.005 });
-        return [MOVING, PLAYING].map((rhythm) => [rhythm, pace.size(full, rhythm)]); }"""
-    for rhythm, size in modules.evaluate(script):
-        drawing = 0.02 * size["width"] * size["height"] / 1e6
-        assert 0.005 + drawing <= rhythm["between"]
-        assert 0.045 - 0.02 + drawing <= rhythm["requests"] * rhythm["between"]
 
 
 def test_a_static_scene_is_not_played(modules: Page):
