@@ -150,7 +150,7 @@ def check_times(
     first, last = session.scene.metadata.time_range
     if shutter is not None and motion_dt is not None:
         raise InvalidInput("shutter", "left out if motion is drawn", "given")
-    if motion_dt is not None and session.scene.metadata.plan.startswith("frames:"):
+    if motion_dt is not None and session.scene.metadata.is_switched:
         raise InvalidInput("dt", "left out: this scene switches from frame to frame, nothing moves", motion_dt)
     for field, time in _times(t, shutter, motion_dt):
         if not first <= time <= last:

@@ -15,7 +15,7 @@ from export.exporters.spz import write_spz
 from export.exporters.usd import read_usd, write_usd
 from export.exporters.visionary import visionary_model
 from export.exporters.visionary_scene import visionary_scene
-from export.importers.sequence import is_switched, of_the_moment
+from export.importers.sequence import of_the_moment
 from export.importers.splats.formats import read_splats
 from export.jobs.store import stored_anew
 from export.jobs.write import set_properties, storage_differences, write_measured
@@ -111,7 +111,7 @@ def _one(session: DeformationSession, options: ConvertOptions, file: Path, t: fl
     """Write a file of one time; returns its PSNR against the scene, dB."""
     metadata = session.scene.metadata
     place, scale = metadata.scene_to_world, _written_units(file, metadata)
-    gaussians = of_the_moment(session.gaussians(t), metadata.plan).scaled(scale)
+    gaussians = of_the_moment(session.gaussians(t), metadata).scaled(scale)
     with replacing(file) as temporary:
         if file.suffix == ".spz":
             write_spz(temporary, gaussians, metadata.antialiasing)
@@ -148,14 +148,14 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
     """Write the scene's whole time range, or one time."""
     out, metadata = options.out, session.scene.metadata
     moves = session.scene.moving_count and options.t is None
-    if moves and is_switched(metadata.plan):
+    if moves and metadata.is_switched:
         raise InvalidInput("t", "given: frames of this scene are switched, and USD would blend them", "nothing")
     single = metadata.time_range[0] if options.t is None else options.t
     times = _times(session, options) if moves else [single]
     check, scale = RoundTrip(session), _written_units(out, metadata)
 
     def pose(t: float) -> Gaussians:
-        return of_the_moment(session.gaussians(t), metadata.plan).scaled(scale)
+        return of_the_moment(session.gaussians(t), metadata).scaled(scale)
 
     with tracked(console) as progress, replacing(out) as temporary:
         on_frame = progress("writing frames", len(times))

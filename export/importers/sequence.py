@@ -31,6 +31,7 @@ from export.trajectories.splines import design
 from export.trajectories.stored import GriddedPoses, StoredPoses, of_ids
 from msdgs_serve.scene.baked import APPEARANCE, MOVING_OUTPUTS, BakedScene
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.metadata import SceneMetadata
 from msdgs_serve.scene.similarity import Similarity
 from msdgs_train.gaussians.scale_space import MIN_SCALE
 
@@ -141,14 +142,9 @@ def shown_rows(sequence: Frames, number: int) -> slice:
     return slice(start, start + len(sequence.gaussians[number]))
 
 
-def is_switched(plan: str) -> bool:
-    """Whether a scene of this plan switches from frame to frame without blending."""
-    return plan.startswith("frames:")
-
-
-def of_the_moment(gaussians: Gaussians, plan: str) -> Gaussians:
-    """The Gaussians of the frame that is shown, without those of other frames in a scene of the plan `frames:n`."""
-    if not is_switched(plan):
+def of_the_moment(gaussians: Gaussians, metadata: SceneMetadata) -> Gaussians:
+    """The Gaussians of the frame that is shown, without those of other frames if the scene is switched."""
+    if not metadata.is_switched:
         return gaussians
     return _rows(gaussians, np.flatnonzero((gaussians.scales > MIN_SCALE).any(axis=1)))
 

@@ -354,6 +354,8 @@ class SceneDetail(SceneEntry):
     layers: list[str] = Field(description="kinds of the deformation layers, in order")
     steps: int = Field(description="number of layers that can be applied one by one; 0 if the plan doesn't run layers")
     gaussians: GaussianCounts
+    changes: bool = Field(description="whether frames depend on the time; false in a static scene")
+    motion: bool = Field(description="whether Gaussians move, so that the channel `motion` shows something")
     sh_degree: int
     time_range: tuple[float, float]
     duration: float | None = Field(description="of the time range, seconds, if the scene says so")

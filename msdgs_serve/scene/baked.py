@@ -61,6 +61,17 @@ class BakedScene:
         return len(self.static_means)
 
     @property
+    def changes(self) -> bool:
+        """Whether frames depend on time."""
+        first, last = self.metadata.time_range
+        return self.moving_count > 0 and first < last
+
+    @property
+    def has_motion(self) -> bool:
+        """Whether Gaussians move from one time to the next."""
+        return self.changes and not self.metadata.is_switched
+
+    @property
     def posed_outputs(self) -> tuple[str, ...]:
         """What depends on time, in the order of `DeformationSession.pose`."""
         return (*MOVING_OUTPUTS, *self.changing)

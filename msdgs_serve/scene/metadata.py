@@ -76,6 +76,11 @@ class SceneMetadata:
     duration: float | None = None  # of the time range, seconds; None: unknown
     scene_to_world: Similarity = IDENTITY  # from the frame of graph, bounds and cameras to the user's world
 
+    @property
+    def is_switched(self) -> bool:
+        """Whether the scene switches from stored frame to frame, so that no Gaussian moves."""
+        return self.plan.startswith("frames:")
+
     def to_properties(self) -> dict[str, str]:
         """Return the `metadata_props` of a file."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}

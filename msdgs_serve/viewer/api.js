@@ -20,6 +20,9 @@ export class Refusal extends Error {
   }
 }
 
+/** Whether an error says that something isn't there. */
+export const isMissing = (error) => error instanceof Refusal && error.status === 404;
+
 export const readKey = () => sessionStorage.getItem(KEY) ?? "";
 
 export function keepKey(key) {

@@ -1,5 +1,7 @@
 // The work-precision diagram of a report: milliseconds on the x axis, PSNR of the worst frame on the y axis.
 
+import { decibels, duration, size } from "./numbers.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 const WIDTH = 320;
 const HEIGHT = 230;
@@ -13,7 +15,7 @@ const PLACES = [[1, 1.5, 2, 3, 4, 5, 6, 7, 8], [1, 2, 5], [1]]; // ticks per dec
 const MAX_TICKS = 6;
 const KINDS = ["network", "prefix", "compact"];
 
-/** Draw into an <svg>; `tell(text)` is called with a description of the selected point. */
+/** Draw into an <svg>; `tell(text)` is called with a description of the point that is focused or nearest to the pointer. */
 export function drawDiagram(svg, report, tell) {
   const points = report.points.map(pointOf).sort((a, b) => a.milliseconds - b.milliseconds);
   const across = scale(points.map((point) => Math.log(point.milliseconds)), [LEFT + 8, WIDTH - RIGHT - 8]);
@@ -27,6 +29,12 @@ export function drawDiagram(svg, report, tell) {
     frontLine(points, x, upwards),
     ...points.map((point) => dot(point, x(point.milliseconds), upwards(point.psnr), tell)),
   );
+  svg.onpointermove = svg.onclick = (event) => {
+    const box = svg.getBoundingClientRect();
+    const [right, down] = [event.clientX - box.left, event.clientY - box.top].map((length) => (length * WIDTH) / box.width);
+    const away = (point) => Math.hypot(x(point.milliseconds) - right, upwards(point.psnr) - down);
+    tell(sentence(points.reduce((nearest, point) => (away(point) < away(nearest) ? point : nearest))));
+  };
   tell(sentence(points.find((point) => point.chosen) ?? points[0]));
 }
 
@@ -98,15 +106,15 @@ function dot(point, x, y, tell) {
     cx: x, cy: y, r: point.chosen ? 6 : 4.5,
     tabindex: 0, role: "img", "aria-label": sentence(point),
   }); // prettier-ignore
-  for (const event of ["pointerenter", "focus", "click"]) drawn.addEventListener(event, () => tell(sentence(point)));
+  drawn.addEventListener("focus", () => tell(sentence(point)));
   return drawn;
 }
 
 function sentence(point) {
-  const pruned = point.pruned === null ? "all of it" : `pruned to ${point.pruned} dB`;
-  const error = point.psnr >= MAX_DB ? "exact" : `${point.psnr.toFixed(1)} dB in the worst frame`;
+  const pruned = point.pruned === null ? "all of it" : `pruned to ${decibels(point.pruned)}`;
+  const error = point.psnr >= MAX_DB ? "exact" : `${decibels(point.psnr)} in the worst frame`;
   const served = point.chosen ? "Chosen: " : "";
-  return `${served}${point.plan}, ${pruned}. ${point.milliseconds.toFixed(1)} ms, ${error}, ${(point.bytes / 1e6).toFixed(2)} MB.`;
+  return `${served}${point.plan}, ${pruned}. ${duration(point.milliseconds / 1000)}, ${error}, ${size(point.bytes)}.`;
 }
 
 function make(kind, attributes, text = "") {

@@ -1,4 +1,4 @@
-// Requests frames one at a time: small ones during motion, a full one after it.
+// Requests frames: small ones during motion, one at a time, in playback one ahead; a full one after it.
 // A full frame in progress is aborted when something moves, and the service cancels its render.
 
 import { Refusal, received, render } from "./api.js";
@@ -6,16 +6,20 @@ import { Refusal, received, render } from "./api.js";
 const FULL_AFTER = 150; // milliseconds
 const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
 const MIN_PIXELS = 64 * 64;
+const MOST_REQUESTS = 2; // in flight during playback: the next one hides the way to the service
 
 export class Frames {
   /**
-   * `host` has: size() of a full frame in pixels; body(); isMoving(); show(bitmap, facts); failed(error).
+   * `host` has: size() of a full frame in pixels; body(); isPlaying(); isMoving(), by itself or by playback;
+   * show(bitmap, facts); failed(error).
    */
   constructor(host, pace) {
     this.host = host;
     this.pace = pace;
     this.maxPixels = 2.5e6;
-    this.inFlight = null;
+    this.inFlight = new Set(); // of requests
+    this.asked = 0; // number of requests so far
+    this.drawn = 0; // number of the request whose frame is shown
     this.wanted = false;
     this.changedAt = 0;
     this.timer = 0;
@@ -23,19 +27,29 @@ export class Frames {
     this.refused = false; // whether the service refused the last request; the next one waits for a change
   }
 
-  /** The view has changed. `cut`: the frame in progress is useless. */
+  /** The view has changed. `cut`: frames in progress are useless. */
   change({ cut = false } = {}) {
     this.changedAt = performance.now();
     this.wanted = true;
     this.shown = null;
-    if (this.inFlight && (cut || this.#givesUp(this.inFlight))) this.inFlight.abort.abort();
+    for (const request of this.inFlight) if (cut || this.#givesUp(request)) request.abort.abort();
     this.#next();
+  }
+
+  /** Ask for nothing more, and show nothing that was asked for. */
+  stop() {
+    this.paused = true;
+    for (const { abort } of this.inFlight) abort.abort();
   }
 
   /** Revalidate the frame that is shown, by its ETag. */
   async check() {
-    if (this.paused || this.refused || this.inFlight || !this.shown || this.#isMoving()) return;
-    await this.#fetch({ full: true, etag: this.shown.etag });
+    if (this.paused || this.refused || this.isBusy || !this.shown || this.#isMoving()) return;
+    await this.#fetch({ full: true, size: this.fullSize(), etag: this.shown.etag });
+  }
+
+  get isBusy() {
+    return this.inFlight.size > 0;
   }
 
   /** Width and height of a frame in full quality. */
@@ -49,51 +63,62 @@ export class Frames {
     return this.host.isMoving() || performance.now() - this.changedAt < FULL_AFTER;
   }
 
-  #givesUp({ full, pixels, asked }) {
-    return full || this.pace.givesUp(pixels, (performance.now() - asked) / 1000);
+  #givesUp({ full, pixels, at }) {
+    return full || this.pace.givesUp(pixels, (performance.now() - at) / 1000);
   }
 
   #next() {
     clearTimeout(this.timer);
-    if (this.paused || this.inFlight) return;
-    if (this.wanted && this.#isMoving()) {
-      this.wanted = false;
-      this.#fetch({ full: false });
-    } else if (this.wanted || (!this.shown && !this.refused)) {
-      const wait = this.host.isMoving() ? FULL_AFTER : FULL_AFTER - (performance.now() - this.changedAt);
-      if (wait > 0) {
-        this.timer = setTimeout(() => this.#next(), wait + 1);
-        return;
-      }
-      this.wanted = false;
-      this.#fetch({ full: true });
-    }
+    if (this.paused) return;
+    if (this.wanted && this.#isMoving()) this.#askMoving();
+    else if (!this.isBusy && (this.wanted || (!this.shown && !this.refused))) this.#askFull();
   }
 
-  async #fetch({ full, etag }) {
-    const size = full ? this.fullSize() : this.pace.size(this.fullSize());
+  #askMoving() {
+    const isPlaying = this.host.isPlaying();
+    if (this.inFlight.size >= (isPlaying ? MOST_REQUESTS : 1)) return;
+    if (isPlaying && !this.pace.takesTurn(performance.now() / 1000)) return; // the next tick of playback asks again
+    this.wanted = false;
+    this.#fetch({ full: false, size: this.pace.size(this.fullSize()) });
+  }
+
+  #askFull() {
+    const wait = this.host.isMoving() ? FULL_AFTER : FULL_AFTER - (performance.now() - this.changedAt);
+    if (wait > 0) {
+      this.timer = setTimeout(() => this.#next(), wait + 1);
+      return;
+    }
+    this.wanted = false;
+    this.#fetch({ full: true, size: this.fullSize() });
+  }
+
+  async #fetch({ full, size, etag }) {
     const body = { ...this.host.body(), ...size, ...(full ? { format: "png" } : { format: "jpeg", quality: 85 }) };
-    const abort = new AbortController();
-    this.inFlight = { abort, full, pixels: size.width * size.height, asked: performance.now() };
+    const request = {
+      number: (this.asked += 1), full, size, pixels: size.width * size.height,
+      at: performance.now(), abort: new AbortController(),
+    }; // prettier-ignore
+    this.inFlight.add(request);
     try {
-      const response = await render(body, { signal: abort.signal, etag });
-      if (response.status !== 304) await this.#show(response, size, full, etag !== undefined);
+      const response = await render(body, { signal: request.abort.signal, etag });
+      if (response.status !== 304) await this.#show(response, request, etag !== undefined);
     } catch (error) {
       this.#failed(error);
     } finally {
-      this.inFlight = null;
+      this.inFlight.delete(request);
     }
     this.#next();
   }
 
-  async #show(response, size, full, isNews) {
-    const { pixels, asked, abort } = this.inFlight;
+  async #show(response, { number, full, size, pixels, at, abort }, isNews) {
     const bitmap = await createImageBitmap(await received(response.blob()));
-    if (abort.signal.aborted) return;
     await new Promise(requestAnimationFrame);
-    const seconds = (performance.now() - asked) / 1000;
+    if (abort.signal.aborted || number < this.drawn) return; // a later one has overtaken it
+    this.drawn = number;
+    const seconds = (performance.now() - at) / 1000;
     const stages = timings(response.headers.get("Server-Timing"));
-    if (!full) this.pace.measured(pixels, seconds, (stages.draw ?? 0) + (stages.encode ?? 0));
+    const { queue = 0, draw = 0, encode = 0 } = stages;
+    if (!full) this.pace.measured(pixels, seconds - queue, draw + encode);
     this.host.show(bitmap, { ...size, full, seconds, stages, isNews });
     bitmap.close();
     this.refused = false;

@@ -1,58 +1,81 @@
 // The page: its state and the connections between its parts.
 
-import { call, getJson, keepKey, readKey, render, scenePath } from "./api.js";
+import { getJson, isMissing, keepKey, readKey, scenePath } from "./api.js";
 import { Camera } from "./camera.js";
 import { Connection } from "./connection.js";
 import { Controls } from "./controls.js";
 import { drawDiagram } from "./diagram.js";
+import { Exports } from "./exports.js";
 import { showFacts } from "./facts.js";
 import { Frames } from "./frames.js";
 import { Layers } from "./layers.js";
+import { NO_SCENES, noScene, noView, sceneGone } from "./messages.js";
 import { Pace } from "./pace.js";
 import { Player } from "./player.js";
-import { frameBody, numbersBody } from "./request.js";
+import { frameBody } from "./request.js";
 import { SceneList } from "./scenes.js";
-import { copy, curlCommand, fromHash, save, toHash } from "./share.js";
+import { fromHash, toHash } from "./share.js";
 import { Stage } from "./stage.js";
 import { Timeline } from "./timeline.js";
+import { Views } from "./views.js";
 
 const REFRESH_EVERY = 3000; // milliseconds, for changed scenes
-const NOTICE_FOR = 2500;
-const VIEWS = ["rgb", "depth", "motion", "gaussians"];
 
 const find = (id) => document.getElementById(id);
 const layers = new Layers({ changed: () => changed() });
-const state = { scene: null, camera: null, player: new Player(), layers, view: "rgb" };
+const views = new Views(find("view"), setView);
+const state = {
+  scene: null, camera: null, player: new Player(), layers,
+  get view() { return views.current; },
+}; // prettier-ignore
 const pace = new Pace();
 const stage = new Stage(find("image"), find("status"));
 const timeline = new Timeline(state.player, { changed: () => changed(), started: run });
 const connection = new Connection(find("banner"), { recovered: lookAgain, keyNeeded });
-const scenes = new SceneList(find("scenes"), { open: (name) => guarded(() => open(name)), isIdle });
+const scenes = new SceneList(find("scenes"), { open: choose, isIdle });
 const controls = new Controls(find("image"), { camera: () => state.camera, moved: () => moved(), command });
 const frames = new Frames(
   {
     size: () => stage.size(state),
     body: () => frameBody(state),
+    isPlaying: () => state.player.playing,
     isMoving: () => state.player.playing || controls.flying.size > 0,
     show,
     failed: (error) => connection.failed(error),
   },
   pace,
 );
+new Exports({ state: () => state, size: () => frames.fullSize(), guarded });
+let asked = {}; // what the address or a click has asked for last
 let opening = null; // the AbortController of a scene that is being opened
 let needsKey = false; // whether the service has asked for a key, until the user acts
 let isFast = false;
 let running = 0;
 
+function choose(name) {
+  asked = { scene: name };
+  guarded(() => open(name));
+}
+
 async function open(name, look = {}) {
   opening?.abort();
   const { signal } = (opening = new AbortController());
-  const scene = await getJson(scenePath(name), { signal }).finally(() => signal.aborted || (opening = null));
+  let scene;
+  try {
+    scene = await getJson(scenePath(name), { signal });
+  } catch (error) {
+    if (isMissing(error)) return closeScene(noScene(name));
+    throw error;
+  } finally {
+    if (!signal.aborted) opening = null;
+  }
   needsKey = false;
   const isAnother = state.scene?.name !== name;
   state.scene = scene;
-  state.player.range = scene.time_range;
-  state.player.duration = scene.duration;
+  document.body.classList.remove("empty");
+  state.player.open(scene);
+  timeline.open();
+  stage.open(scene.background, isAnother);
   if (isAnother) {
     state.camera = new Camera(scene.view);
     state.camera.aspect = stage.aspect();
@@ -64,11 +87,25 @@ async function open(name, look = {}) {
   state.camera.sceneCamera = null; // unless the file still has it, maybe with another pose
   applyLook({ sceneCamera });
   applyLook(look);
+  const wanted = look.view ?? views.current;
+  notice(views.open(scene, wanted) ? "" : noView(wanted));
   describe();
   connection.say("");
   frames.paused = false;
   frames.change({ cut: true });
-  await showReport(scene);
+  return showReport(scene);
+}
+
+/** Show no scene, but why, and the list. */
+function closeScene(reason) {
+  state.scene = state.camera = null;
+  state.player.playing = false;
+  frames.stop();
+  document.body.classList.add("empty");
+  document.title = find("title").textContent = "msdgs";
+  scenes.mark(null);
+  notice("");
+  connection.say(reason);
 }
 
 /** Open the current scene again, unless another one is being opened. */
@@ -76,14 +113,13 @@ async function reopen() {
   if (!opening) await open(state.scene.name);
 }
 
-function applyLook({ t = null, steps, at = null, sceneCamera = null, view = null }) {
+function applyLook({ t = null, steps, at = null, sceneCamera = null }) {
   if (t !== null) state.player.seekTime(t);
   if (steps !== undefined) layers.set(steps); // null in an address without them: all
   if (at) state.camera.reset();
   if (at) [state.camera.azimuth, state.camera.elevation, state.camera.distance] = at;
   if (at) state.camera.target = at.slice(3);
   if (sceneCamera in state.scene.cameras) state.camera.take(state.scene.cameras[sceneCamera], sceneCamera);
-  if (VIEWS.includes(view)) state.view = view;
 }
 
 function describe() {
@@ -91,13 +127,11 @@ function describe() {
   document.title = `${scene.name} · msdgs`;
   find("title").textContent = scene.name;
   scenes.mark(scene.name);
-  stage.background(scene.background);
   showFacts(find("facts"), scene);
   const options = scene.cameras.map((camera, i) => new Option(camera.name, i));
   find("camera").replaceChildren(new Option("Free view", ""), ...options);
   find("camera").hidden = scene.cameras.length === 0;
   find("camera").value = state.camera.sceneCamera ?? "";
-  find("view").elements.view.value = state.view;
   find("docs").hidden = readKey() !== ""; // a link sends no key
   timeline.show();
 }
@@ -105,7 +139,7 @@ function describe() {
 async function showReport({ name, report: isThere }) {
   const section = find("report");
   const report = isThere ? await getJson(`${scenePath(name)}/report`).catch(() => null) : null;
-  if (state.scene.name !== name) return;
+  if (state.scene?.name !== name) return;
   section.hidden = !report?.points?.length;
   if (section.hidden) return;
   const { processor, threads } = report.machine;
@@ -135,7 +169,7 @@ function show(bitmap, facts) {
 
 /** Whether thumbnails may be rendered now. */
 function isIdle() {
-  return !connection.isLost && (frames.shown || frames.paused || frames.refused) && !frames.inFlight;
+  return !connection.isLost && (frames.shown || frames.paused || frames.refused) && !frames.isBusy;
 }
 
 /** Advance playback and flight with animation frames, while either is active. */
@@ -157,11 +191,12 @@ function run() {
 }
 
 function command(key) {
-  const place = VIEWS[Number(key) - 1];
-  if (place) setView(place);
-  else if (key === " ") timeline.toggle();
-  else if (key === ",") timeline.step(-1);
-  else if (key === ".") timeline.step(1);
+  const view = views.names[Number(key) - 1];
+  const { changes } = state.player;
+  if (view) setView(view);
+  else if (key === " " && changes) timeline.toggle();
+  else if (key === "," && changes) timeline.step(-1);
+  else if (key === "." && changes) timeline.step(1);
   else if (key === "r") resetCamera();
   else if (key === "?") find("help").showModal();
   else return false;
@@ -169,8 +204,7 @@ function command(key) {
 }
 
 function setView(view) {
-  state.view = view;
-  find("view").elements.view.value = view;
+  notice(views.show(view) ? "" : noView(view));
   frames.change({ cut: true });
 }
 
@@ -187,10 +221,10 @@ async function lookAgain() {
     await scenes.refresh();
     scenes.mark(state.scene?.name);
     if (opening) return;
-    if (!state.scene) await start();
+    if (!state.scene) await start(asked);
     else if (!scenes.names.includes(state.scene.name)) {
       frames.paused = true;
-      connection.say(`${state.scene.name} is gone.`);
+      connection.say(sceneGone(state.scene.name));
     } else if (frames.paused || (await isReplaced())) await reopen();
     else await frames.check();
   });
@@ -202,12 +236,14 @@ async function isReplaced() {
   return frames.refused && (await getJson(scenePath(name))).sha256 !== sha256;
 }
 
-async function start() {
-  const look = fromHash(location.hash); // a frame that arrives meanwhile replaces it
+/** Show what the address asks for, or say that it isn't there. */
+async function start(look = fromHash(location.hash)) {
+  asked = look; // a frame that arrives meanwhile replaces the address
   await scenes.refresh();
-  const name = scenes.names.includes(look.scene) ? look.scene : scenes.names[0];
-  if (name === undefined) connection.say("No scenes. Files that are added to the service’s folder appear here.");
-  else await open(name, look);
+  const { names } = scenes;
+  if (names.length === 0) return closeScene(NO_SCENES);
+  const name = look.scene === null ? names[0] : scenes.find(look.scene);
+  return name === undefined ? closeScene(noScene(look.scene)) : open(name, look);
 }
 
 async function guarded(action) {
@@ -225,27 +261,9 @@ function keyNeeded() {
 
 function notice(text) {
   find("notice").textContent = text;
-  setTimeout(() => find("notice").textContent === text && (find("notice").textContent = ""), NOTICE_FOR);
-}
-
-async function takeAlong(kind) {
-  const size = frames.fullSize();
-  if (kind === "curl") {
-    const text = curlCommand({ ...frameBody(state), ...size, format: "png" });
-    if (await copy(text)) return notice("Copied.");
-    find("command").value = text;
-    find("command-dialog").showModal();
-    find("command").select();
-    return undefined;
-  }
-  const { name } = state.scene;
-  if (kind === "onnx") return save(await call(`${scenePath(name)}/file`), `${name}.onnx`);
-  const body = kind === "exr" ? numbersBody(state) : { ...frameBody(state), format: kind };
-  return save(await render({ ...body, ...size }), `${name}-${state.player.t}.${kind}`);
 }
 
 function listen() {
-  find("view").addEventListener("change", (event) => setView(event.target.value));
   find("reset").addEventListener("click", resetCamera);
   find("camera").addEventListener("change", ({ target }) => {
     if (target.value === "") return;
@@ -253,9 +271,6 @@ function listen() {
     state.camera.take(state.scene.cameras[index], index);
     moved();
   });
-  for (const button of document.querySelectorAll("[data-take]")) {
-    button.addEventListener("click", () => state.scene && guarded(() => takeAlong(button.dataset.take)));
-  }
   for (const button of document.querySelectorAll("[data-opens]")) {
     button.addEventListener("click", () => find(button.dataset.opens).showModal());
   }
@@ -266,10 +281,10 @@ function listen() {
     guarded(start);
   });
   for (const event of ["keydown", "keyup"]) document.addEventListener(event, ({ shiftKey }) => (isFast = shiftKey));
-  window.addEventListener("hashchange", () => guarded(start));
+  window.addEventListener("hashchange", () => guarded(() => start()));
   stage.onResize(() => {
     if (state.camera) state.camera.aspect = stage.aspect();
-    changed();
+    if (!frames.refused) changed(); // a message that appears resizes the image too
   });
   setInterval(lookAgain, REFRESH_EVERY);
 }

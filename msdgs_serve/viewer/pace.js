@@ -1,15 +1,24 @@
-// Chooses the size of frames during motion from the measured times of earlier frames.
+// Chooses the size of frames during motion from the measured times of earlier frames, and when playback asks for them.
 
 const PATIENCE = 0.5; // seconds of drawing after which an outdated frame is given up for a smaller one
 const TARGET = 1 / 18; // seconds per frame: 15 frames per second with a margin
 const MIN_PIXELS = 128 * 96;
 const DRAWING_SHARE = 0.3; // minimal fraction of the target for drawing, even if posing takes longer
 const SMOOTHING = 0.5; // weight of the newest measurement
+const PLAYED = 1 / 30; // seconds per frame of playback, which has a request ahead
 
 export class Pace {
   constructor() {
     this.secondsPerPixel = null;
     this.rest = 0; // seconds per frame independent of its pixels: posing, network, display
+    this.due = 0; // when playback may ask for its next frame, seconds
+  }
+
+  /** Whether playback may ask for a frame at `now`, seconds. If so, the next one is due a frame's time later. */
+  takesTurn(now) {
+    if (now < this.due) return false;
+    this.due = Math.max(this.due + PLAYED, now); // on average; what was missed isn't made up for
+    return true;
   }
 
   /** Record a frame that took `seconds` from request to display, `drawing` of them for its pixels. */

@@ -10,14 +10,27 @@ export class Player {
   constructor() {
     this.range = [0, 1];
     this.duration = null; // of the range, seconds
+    this.changes = true; // whether the scene depends on time
     this.place = 0; // fraction of the time range
+    this.exact = 0; // the same, not rounded to a step
     this.playing = false;
     this.loop = true;
     this.speed = 1;
   }
 
+  /** Take over times of a scene, GET /scenes/{name}. */
+  open({ time_range: range, duration, changes }) {
+    Object.assign(this, { range, duration, changes });
+    this.playing &&= changes;
+  }
+
   get t() {
     return this.at(this.place);
+  }
+
+  /** Seconds of a whole run at speed 1. */
+  get seconds() {
+    return this.duration ?? RUN_SECONDS;
   }
 
   /** Return the scene's time at a fraction of its range, exact at both ends. */
@@ -29,7 +42,7 @@ export class Player {
   }
 
   seek(place) {
-    this.place = Math.min(Math.max(place, 0), 1);
+    this.place = this.exact = Math.min(Math.max(place, 0), 1);
   }
 
   seekTime(t) {
@@ -41,17 +54,17 @@ export class Player {
     this.seek(Math.round(this.place * TIME_STEPS + count) / TIME_STEPS);
   }
 
+  /** Play, if anything changes with time. */
   start() {
-    if (this.place >= 1) this.place = 0;
-    this.playing = true;
-    this.exact = this.place;
+    if (this.place >= 1) this.seek(0);
+    this.playing = this.changes;
   }
 
   /** Advance playback by some seconds. */
   advance(seconds) {
-    this.exact += (seconds * this.speed) / (this.duration ?? RUN_SECONDS);
+    this.exact += (seconds * this.speed) / this.seconds;
     if (this.exact >= 1 && !this.loop) {
-      this.place = 1;
+      this.seek(1);
       this.playing = false;
       return;
     }

@@ -39,16 +39,24 @@ export class SceneList {
       if (!scene.problem && this.failed.delete(scene.name)) this.waiting.add(scene.name);
       item.classList.toggle("broken", scene.problem);
       item.querySelector(".note").textContent = scene.problem ? "file is broken" : "";
-      item.title = scene.reason ?? "";
+      item.title = scene.reason ?? scene.name;
     }
   }
 
-  /** Mark the current scene. */
+  /** Return the name of the listed scene that a link means, if any; composed and decomposed accents are the same. */
+  find(name) {
+    return this.items.has(name) ? name : this.names.find((each) => each.normalize() === name.normalize());
+  }
+
+  /** Mark the current scene, and scroll to it if it is another one. */
   mark(name) {
     for (const [each, item] of this.items) {
       const button = item.querySelector("button");
-      if (each === name) button.setAttribute("aria-current", "true");
-      else button.removeAttribute("aria-current");
+      if (each !== name) button.removeAttribute("aria-current");
+      else if (!button.hasAttribute("aria-current")) {
+        button.setAttribute("aria-current", "true");
+        this.#scrollTo(item);
+      }
     }
   }
 
@@ -67,6 +75,15 @@ export class SceneList {
     this.items.set(name, item);
     this.observer.observe(item);
     return item;
+  }
+
+  /** Bring an item to the middle of the list, if part of it is out of sight; the page itself doesn't scroll. */
+  #scrollTo(item) {
+    const [seen, box] = [this.list, item].map((each) => each.getBoundingClientRect());
+    const isInside = box.top >= seen.top && box.bottom <= seen.bottom && box.left >= seen.left && box.right <= seen.right;
+    if (isInside) return;
+    const [left, top] = [box.left + box.right - seen.left - seen.right, box.top + box.bottom - seen.top - seen.bottom];
+    this.list.scrollBy(left / 2, top / 2);
   }
 
   #remove(name, item) {

@@ -14,14 +14,31 @@ export function curlCommand(body) {
 /** Quote a text for a shell. */
 const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
 
-/** Copy a text. Return whether that worked; browsers forbid it on pages without HTTPS from other machines. */
+/** Return the address of the page with a view. */
+export const linkTo = (state) => new URL(toHash(state), location.href).href;
+
+/** Copy a text. Return whether that worked; browsers may forbid both ways. */
 export async function copy(text) {
   try {
-    await navigator.clipboard.writeText(text);
+    await navigator.clipboard.writeText(text); // without HTTPS only for pages from this machine
     return true;
   } catch {
-    return false;
+    return copySelected(text);
   }
+}
+
+/** Copy a text by the command that needs no permission, but a selection. */
+function copySelected(text) {
+  const focused = document.activeElement;
+  const field = document.createElement("textarea");
+  field.value = text;
+  field.className = "unseen";
+  document.body.append(field);
+  field.select();
+  const isCopied = document.execCommand("copy");
+  field.remove();
+  focused?.focus({ preventScroll: true });
+  return isCopied;
 }
 
 /** Save the body of a response as a file. */

@@ -1,5 +1,7 @@
 // The image, and the status line with its times.
 
+import { duration } from "./numbers.js";
+
 const MAX_PIXEL_RATIO = 2; // limit of device pixels per CSS pixel; more isn't visible
 
 export class Stage {
@@ -28,9 +30,15 @@ export class Stage {
     return { width: Math.max(1, Math.round(width)), height: Math.max(1, Math.round(height)) };
   }
 
-  /** Set the color around the image to the scene's background, sRGB from 0 to 1. */
-  background(color) {
-    this.canvas.style.background = `rgb(${color.map((x) => Math.round(255 * x)).join(" ")})`;
+  /** Set the color around the image to the scene's background, sRGB from 0 to 1; `isAnother`: show nothing else yet. */
+  open(color, isAnother) {
+    const background = `rgb(${color.map((x) => Math.round(255 * x)).join(" ")})`;
+    this.canvas.style.background = background;
+    if (!isAnother) return;
+    this.context.fillStyle = background;
+    this.context.fillRect(0, 0, this.canvas.width, this.canvas.height);
+    this.canvas.dataset.shown = "";
+    this.status.textContent = "\u00a0";
   }
 
   show(bitmap, { width, height, full, seconds, stages }) {
@@ -52,11 +60,9 @@ export class Stage {
     this.shownAt = now;
     if (between < 1) this.rate = this.rate ? this.rate + 0.2 * (1 / between - this.rate) : 1 / between;
     else this.rate = 0;
-    const parts = [`${width} × ${height}`, `${milliseconds(seconds)} ms`];
+    const parts = [`${width} × ${height}`, duration(seconds)];
     if (!full && this.rate) parts.push(`${Math.round(this.rate)} frames/s`);
-    if (full) for (const name of ["pose", "draw", "encode"]) parts.push(`${name} ${milliseconds(stages[name] ?? 0)}`);
+    if (full) for (const name of ["pose", "draw", "encode"]) parts.push(`${name} ${duration(stages[name] ?? 0)}`);
     this.status.textContent = parts.join(" · ");
   }
 }
-
-const milliseconds = (seconds) => Math.round(1000 * seconds);

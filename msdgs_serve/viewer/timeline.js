@@ -1,5 +1,6 @@
-// The time slider and its buttons.
+// The time slider and its buttons, for scenes that change with time.
 
+import { plain } from "./numbers.js";
 import { SPEEDS } from "./player.js";
 
 export class Timeline {
@@ -8,7 +9,8 @@ export class Timeline {
     this.player = player;
     this.host = host;
     const find = (id) => document.getElementById(id);
-    [this.play, this.slider, this.time, this.loop, this.speed] = ["play", "time", "time-text", "loop", "speed"].map(find);
+    const ids = ["timeline", "play", "time", "time-text", "loop", "speed"];
+    [this.group, this.play, this.slider, this.time, this.loop, this.speed] = ids.map(find);
     this.play.addEventListener("click", () => this.toggle());
     this.slider.addEventListener("input", () => {
       player.playing = false;
@@ -21,6 +23,13 @@ export class Timeline {
     });
     this.speed.replaceChildren(...SPEEDS.map((speed) => new Option(`${speed}×`, speed, speed === 1, speed === 1)));
     this.speed.addEventListener("change", () => (player.speed = Number(this.speed.value)));
+  }
+
+  /** Follow the player to another scene. */
+  open() {
+    this.group.hidden = !this.player.changes;
+    this.speed.title = `At 1× a run takes ${plain(this.player.seconds)} seconds`;
+    this.show();
   }
 
   toggle() {
@@ -38,13 +47,20 @@ export class Timeline {
 
   show() {
     const { player } = this;
-    const text = `t ${player.t.toFixed(3)}`;
+    const text = this.#text();
     this.slider.value = player.place;
     this.slider.setAttribute("aria-valuetext", text);
     this.time.textContent = text;
     this.play.dataset.playing = player.playing;
     this.play.setAttribute("aria-label", player.playing ? "Pause" : "Play");
     this.loop.setAttribute("aria-pressed", player.loop);
+  }
+
+  /** The time with as many digits as tell a thousandth of the range. */
+  #text() {
+    const [first, last] = this.player.range;
+    const digits = 3 - Math.floor(Math.log10(last - first || 1));
+    return `t ${this.player.t.toFixed(Math.min(Math.max(digits, 0), 12))}`;
   }
 
   #set() {

@@ -1,21 +1,33 @@
 """A browser for the tests of the page at /."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 
 from tests.support.processes import chromium, wait_until_still
+from tests.support.service import serving
 
 MILLISECONDS = 60_000
 """Maximum wait for something on a page."""
+expect.set_options(timeout=MILLISECONDS)
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     with chromium() as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def modules(browser: Browser, scene: Path) -> Iterator[Page]:
+    """A page whose modules can be imported by scripts."""
+    with serving(scene) as client, browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"{client.base_url}/viewer/icon.svg")
+        yield page
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Motion vectors: the displacement in pixels, over a time, of the surface seen at each pixel."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,6 +50,27 @@ def test_a_frame_warped_by_its_motion_is_the_later_frame(scene: Path):
     expected = pixel_of(camera, [0, 0, -0.8]) - pixel_of(camera, [0, 0, -1])
     errors = np.linalg.norm(now.motion[rows, columns] - expected, axis=1)
     assert np.median(errors) < 0.25
+
+
+@pytest.mark.parametrize(
+    ("changes", "motion", "scene"),
+    [
+        (True, True, {}),
+        (True, True, {"plan": "keyframes:5", "layers": ()}),
+        (True, True, {"changing": ("opacities",)}),
+        (True, False, {"plan": "frames:3", "layers": ()}),
+        (False, False, {"moving": 0}),
+        (False, False, {"moving": 0, "plan": "frames:1"}),
+        (False, False, {"time_range": (0.5, 0.5)}),
+    ],
+)
+def test_the_description_says_whether_there_is_motion(
+    tmp_path: Path, changes: bool, motion: bool, scene: dict[str, Any]
+):
+    write_scene(tmp_path / "balls.onnx", **scene)
+    with serving(tmp_path) as client:
+        described = client.get("/scenes/balls").json()
+    assert (described["changes"], described["motion"]) == (changes, motion)
 
 
 def test_behind_the_camera_nothing_moves_and_nothing_breaks(scene: Path):

@@ -1,28 +1,14 @@
 """The page's modules: the camera equals the service's, times are in range, and frame sizes follow the frame time."""
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import numpy as np
 import pytest
 from playwright.sync_api import Page
 
 from msdgs_serve.scene.camera import orbit
-from tests.support.processes import chromium
 from tests.support.scene_files import metadata
-from tests.support.service import serving
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
-
-
-@pytest.fixture(scope="module")
-def modules(scene: Path) -> Iterator[Page]:
-    """A page whose modules can be imported by scripts."""
-    with serving(scene) as client, chromium() as browser, browser.new_context() as context:
-        page = context.new_page()
-        page.goto(f"{client.base_url}/viewer/icon.svg")
-        yield page
 
 
 @pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0), (0.3, 0.2, 0.9)])
@@ -124,7 +110,9 @@ def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nano
 
 
 @pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.0, 2500.0), (0.0, 100_000.0), (0.6, 20.0)])
-def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: float, nanoseconds_per_pixel: float):
+def test_slow_moving_frames_become_small_and_are_shown(
+    modules: Page, page: Page, pose: float, nanoseconds_per_pixel: float
+):
     """The clock is simulated: at first a frame of 600 x 400 pixels takes at least 0.6 s."""
     script = """async ([pose, aPixel]) => {
         const { Frames } = await import("/viewer/frames.js");
@@ -142,13 +130,13 @@ def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: floa
           size: () => ({ width: 1200, height: 800 }),
           body: () => ({}),
           isMoving: () => true,
+          isPlaying: () => false,
           show: (_, { seconds }) => taken.push(seconds),
         };
         const frames = new Frames(host, new Pace());
         frames.paused = false;
         const tick = () => (frames.change(), requestAnimationFrame(tick));
         tick(); }"""
-    page = modules.context.new_page()
     page.clock.install(time=0)
     page.goto(modules.url)
     page.clock.pause_at(1000)
@@ -158,3 +146,90 @@ def test_slow_moving_frames_become_small_and_are_shown(modules: Page, pose: floa
     smallest = pose + 128 * 96 * nanoseconds_per_pixel * 1e-9
     assert taken[-1] < max(1 / 15, smallest + 1 / 30)
     assert sum(taken) > 8, "hardly a frame came after the first ones"
+
+
+def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modules: Page, page: Page):
+    """The clock is simulated: a frame takes 20 ms on the service and 30 ms on its way."""
+    script = """async () => {
+        const { Frames } = await import("/viewer/frames.js");
+        const { Pace } = await import("/viewer/pace.js");
+        Object.assign(window, { asked: [], shown: [], playing: true, t: 0, most: 0 });
+        window.createImageBitmap = async () => ({ close() {} });
+        let inFlight = 0;
+        window.fetch = (_, { body }) => new Promise((answer) => {
+          asked.push([performance.now(), JSON.parse(body)]);
+          most = Math.max(most, inFlight += 1);
+          const headers = new Headers({ "Server-Timing": "pose;dur=5, draw;dur=15" });
+          setTimeout(() => (inFlight -= 1, answer({ ok: true, headers, blob: async () => null })), 50);
+        });
+        const host = {
+          size: () => ({ width: 600, height: 400 }),
+          body: () => ({ t }),
+          isMoving: () => playing,
+          isPlaying: () => playing,
+          show: (_, { full }) => shown.push([full, asked.length]),
+        };
+        window.frames = new Frames(host, new Pace());
+        frames.paused = false;
+        const tick = () => (playing && ((t += 1), frames.change()), requestAnimationFrame(tick));
+        tick(); }"""
+    page.clock.install(time=0)
+    page.goto(modules.url)
+    page.clock.pause_at(1000)
+    page.evaluate(script)
+    page.clock.run_for(10_000)
+    times = [at for at, _ in page.evaluate("asked")]
+    assert 280 <= len(times) <= 302
+    assert page.evaluate("most") == 2
+    page.evaluate("playing = false; frames.change()")
+    page.clock.run_for(1000)
+    last = page.evaluate("asked.at(-1)[1]")
+    assert (last["format"], last["t"]) == ("png", page.evaluate("t")), "the exact frame"
+    assert page.evaluate("shown.at(-1)[0]") is True
+
+
+def test_a_frame_that_was_overtaken_is_not_shown(modules: Page, page: Page):
+    script = """async () => {
+        const { Frames } = await import("/viewer/frames.js");
+        const { Pace } = await import("/viewer/pace.js");
+        const answers = [];
+        const shown = [];
+        window.createImageBitmap = async (blob) => ({ blob, close() {} });
+        window.fetch = (_, { body }) => new Promise((answer) => {
+          const { t } = JSON.parse(body);
+          answers.push(() => answer({ ok: true, headers: new Headers(), blob: async () => t }));
+        });
+        let t = 0;
+        const host = {
+          size: () => ({ width: 60, height: 40 }),
+          body: () => ({ t: (t += 1) }),
+          isMoving: () => true,
+          isPlaying: () => true,
+          show: ({ blob }) => shown.push(blob),
+        };
+        const frames = new Frames(host, new Pace());
+        frames.paused = false;
+        const drawn = () => new Promise((done) => setTimeout(done, 100));
+        frames.change();
+        await drawn();
+        frames.change();
+        answers[1]();
+        await drawn();
+        answers[0]();
+        await drawn();
+        return shown; }"""
+    page.goto(modules.url)
+    assert page.evaluate(script) == [2]
+
+
+def test_a_static_scene_is_not_played(modules: Page):
+    script = """async () => {
+        const { Player } = await import("/viewer/player.js");
+        const player = new Player();
+        player.start();
+        const before = player.playing;
+        player.open({ time_range: [0, 1], duration: null, changes: false });
+        const stopped = player.playing;
+        player.start();
+        return [before, stopped, player.playing, player.t]; }"""
+    assert modules.evaluate(script) == [True, False, False, 0]

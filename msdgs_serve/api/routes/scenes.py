@@ -210,6 +210,8 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         loaded=status.loaded,
         steps=served.session.max_steps,
         gaussians=counts,
+        changes=scene.changes,
+        motion=scene.has_motion,
         view=SceneView(**vars(seen) | {"target": seen.target.tolist(), "up": seen.up.tolist()}),
         report=report_path(store.file(name)).is_file(),
         sha256=served.sha256,
