@@ -118,9 +118,9 @@ class _Entry:
 class SceneStore:
     """Scenes in files and folders, named by the files' stems. Safe to use from several threads.
 
-    Folders are listed again by every call, so that files may be added, changed and removed. `refresh` reloads changed
-    files; meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports. A
-    file that can't be read is tried again after a while.
+    Folders are listed again by every call, so that files may come, change and go. `refresh` reloads changed files;
+    meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports. A file that
+    can't be read is tried again.
 
     Scenes are added to and removed from `folder`, the first one among the paths, whose files never hide those of other
     paths.

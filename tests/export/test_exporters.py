@@ -39,7 +39,6 @@ from msdgs_serve.writing import WriteFailed
 from msdgs_train.gaussians.model_file import SceneInfo
 from tests.support.file_sizes import largest_file
 from tests.support.models import MLP, NODES, SCENE, random_model
-from tests.support.sound_scenes import OLDER
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
 
@@ -380,11 +379,6 @@ def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
 def test_what_cannot_be_written_is_refused_with_an_alternative(tmp_path: Path, plan: str, out: str, message: str):
     with pytest.raises(InvalidInput, match=message):
         run(scene_file(tmp_path, plan), tmp_path / out)
-
-
-def test_products_in_8_bits_of_older_files_are_refused_for_visionary(tmp_path: Path):
-    with pytest.raises(InvalidInput, match=r"--plan compact:65"):
-        run(OLDER / "int8.onnx", tmp_path / "a.visionary.onnx")
 
 
 def test_an_option_without_effect_and_a_missing_folder_are_refused(tmp_path: Path):

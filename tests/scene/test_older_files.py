@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from export.exporters.visionary import visionary_model
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
+from msdgs_serve.scene import InvalidInput
 from tests.support.sound_scenes import OLDER
 from tests.support.tolerances import assert_close
 
@@ -32,3 +34,8 @@ def test_frames_are_unchanged(name: str):
 
 def test_all_files_have_frames():
     assert sorted(np.load(OLDER / "frames.npz")) == sorted(path.stem for path in OLDER.glob("*.onnx"))
+
+
+def test_products_in_8_bits_are_refused_for_visionary():
+    with pytest.raises(InvalidInput, match=r"--plan compact:65"):
+        visionary_model(OLDER / "int8.onnx")
