@@ -122,11 +122,10 @@ class SceneStore:
     meanwhile requests get the old version, and keep it if the new file is invalid, which `status` reports. A file that
     can't be read is tried again.
 
-    Scenes are added to and removed from `folder`, the first one among the paths, whose files never hide those of other
-    paths.
+    Scenes are added to and removed from `folder`, the first of the paths, whose files never hide those of others.
 
-    While all loaded scenes have more than `max_bytes`, the one whose last request is the longest ago is unloaded, and
-    loads again at the next. An old version whose new file is invalid stays, and so does the last scene.
+    Above `max_bytes` in all, the least recently used scene is unloaded, and loads again at the next request. An old
+    version whose new file is invalid stays, and so does the last scene.
     """
 
     def __init__(
