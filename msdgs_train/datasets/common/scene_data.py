@@ -108,8 +108,9 @@ class SceneData:
 
     @property
     def cameras(self) -> list[Camera]:
-        """Those of all frames."""
-        return [frame.camera for frames in self.splits.values() for frame in frames]
+        """Those of all frames, of each pose one."""
+        every = (frame.camera for frames in self.splits.values() for frame in frames)
+        return list({camera.camera_to_world.tobytes(): camera for camera in every}.values())
 
     def normalized(self) -> "SceneData":
         """The same scene in the frame that it is trained in, without points that no camera sees."""
@@ -123,7 +124,7 @@ class SceneData:
         is_guess = points is None and not subject.is_looked_at and subject.distance > 0
         if is_guess:
             warnings.append(UNKNOWN_SIZE.format(subject.distance))
-        if are_at_one_place(cameras):
+        if sum(map(len, self.splits.values())) > 1 and are_at_one_place(cameras):
             warnings.append(ONE_PLACE)
         scene = replace(self, warnings=tuple(warnings), has_nominal_size=self.has_nominal_size and not is_guess)
         if points is not self.points:
