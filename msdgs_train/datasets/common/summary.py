@@ -24,7 +24,7 @@ def summary(scene: SceneData) -> str:
         parts.append(f"masks of {'all' if masked == len(frames) else f'{masked:,}'} images")
     if not place.is_identity:
         x, y, z = place.offset
-        parts.append(f"trained at 1/{place.scale:g} of its size around ({x:g}, {y:g}, {z:g})")
+        parts.append(f"trained at {1 / place.scale:.3g} times its size around ({x:.10g}, {y:.10g}, {z:.10g})")
     return ", ".join(parts)
 
 

@@ -151,6 +151,6 @@ def test_one_line_says_what_was_read():
     scene = placed(SCENES["around, points"], PLACES["everything"]).normalized()
     assert summary(scene) == (
         "D-NeRF layout, 12 train images, 40×30, 12 camera poses, 12 times from 0 to 0.916667, 300 points, trained at "
-        "1/37.1 of its size around (-4000, 20, 9000)"
+        "0.027 times its size around (-4000, 20, 9000)"
     )
     assert summary(SCENES["outwards"]).endswith("no points")
