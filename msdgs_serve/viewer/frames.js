@@ -6,7 +6,7 @@ import { Refusal, received, render } from "./api.js";
 const FULL_AFTER = 150; // milliseconds
 const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
 const MIN_PIXELS = 64 * 64;
-const MOST_REQUESTS = 2; // in flight during playback: the next one hides the way to the service
+const MAX_REQUESTS = 2; // in flight during playback: the next one hides the way to the service
 
 export class Frames {
   /**
@@ -76,7 +76,7 @@ export class Frames {
 
   #askMoving() {
     const isPlaying = this.host.isPlaying();
-    if (this.inFlight.size >= (isPlaying ? MOST_REQUESTS : 1)) return;
+    if (this.inFlight.size >= (isPlaying ? MAX_REQUESTS : 1)) return;
     if (isPlaying && !this.pace.takesTurn(performance.now() / 1000)) return; // the next tick of playback asks again
     this.wanted = false;
     this.#fetch({ full: false, size: this.pace.size(this.fullSize()) });

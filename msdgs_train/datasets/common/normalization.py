@@ -29,7 +29,7 @@ OUTWARD_DISTANCE = 12.0
 """Of what cameras show that don't look at one point, in radii of their positions, if nothing else tells. A room whose
 walls are 6 radii away trains to 26.3 dB with 12, 25.5 with 6, 23.7 with 24 and 20.0 with 4."""
 ONE_PLACE = 1e-7
-"""Spread of positions, as a fraction of the largest coordinate, below which cameras are at one place."""
+"""Spread of positions, as a fraction of the largest coordinate or of `DISTANCE`, below which they are one place."""
 MAX_POINTS = 20_000
 """About as many points are looked for in each image."""
 DIGITS = 3
@@ -58,6 +58,8 @@ def find_subject(cameras: Sequence[Camera], points: np.ndarray | None) -> Subjec
     if points is not None and has_points:
         return Subject(np.median(points, axis=0), float(np.median(depths)), False)
     middle = np.median(positions, axis=0)
+    if are_at_one_place(cameras):
+        return Subject(middle, 0.0, False)
     radius = float(np.median(np.linalg.norm(positions - middle, axis=1)))
     return Subject(middle, OUTWARD_DISTANCE * radius, False)
 
@@ -88,12 +90,18 @@ def seen_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
 def are_at_one_place(cameras: Sequence[Camera]) -> bool:
     """Whether the positions of cameras are the same up to rounding."""
     positions = np.array([camera.position for camera in cameras])
-    return bool(np.ptp(positions, axis=0).max() <= ONE_PLACE * np.abs(positions).max())
+    return bool(np.ptp(positions, axis=0).max() <= ONE_PLACE * max(np.abs(positions).max(), DISTANCE))
+
+
+def are_parallel(cameras: Sequence[Camera]) -> bool:
+    """Whether all optical axes have one direction, so that nothing tells how far away is what they show."""
+    axes = np.array([camera.camera_to_world[:3, 2] for camera in cameras])
+    return bool(np.linalg.eigvalsh(_across(axes).mean(axis=0))[0] < MIN_CONVERGENCE)
 
 
 def _looked_at(positions: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
     """[3] the point nearest to all optical axes, with robust weights; None if they don't look at one."""
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] projects onto the plane normal to an axis
+    across = _across(axes)
     weights, point = np.ones(len(positions)), np.zeros(3)
     origin = np.median(positions, axis=0)  # in float64 coordinates far away would lose the sums' last digits
     local = positions - origin
@@ -106,6 +114,11 @@ def _looked_at(positions: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
         weights = 1 / (misses + np.median(misses) + 1e-9 * np.abs(local).max() + 1e-300)
     in_front = ((point - local) * axes).sum(axis=1) > 0
     return point + origin if in_front.mean() >= MIN_IN_FRONT else None
+
+
+def _across(axes: np.ndarray) -> np.ndarray:
+    """[C, 3, 3] projections onto the planes normal to axes, [C, 3]."""
+    return np.eye(3) - axes[:, :, None] * axes[:, None, :]
 
 
 def _rounded(value: float) -> float:

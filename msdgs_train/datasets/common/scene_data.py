@@ -13,7 +13,13 @@ from msdgs_train.datasets.common.distortion import Distortion, undistort
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import read_rgba, resize_area
 from msdgs_train.datasets.common.masks import WHITE, as_rgba, read_mask
-from msdgs_train.datasets.common.normalization import are_at_one_place, find_subject, normalization, seen_depths
+from msdgs_train.datasets.common.normalization import (
+    are_at_one_place,
+    are_parallel,
+    find_subject,
+    normalization,
+    seen_depths,
+)
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 SPLITS = ("train", "val", "test")
@@ -120,12 +126,14 @@ class SceneData:
         if points is not None and not seen_depths(cameras, points):
             warnings.append(UNSEEN_POINTS.format(len(points)))
             points = None
+        if sum(map(len, self.splits.values())) > 1 and are_at_one_place(cameras):
+            warnings.append(ONE_PLACE)
+        if self.has_nominal_size and are_parallel(cameras):
+            return replace(self, warnings=tuple(warnings))
         subject = find_subject(cameras, points)
         is_guess = points is None and not subject.is_looked_at and subject.distance > 0
         if is_guess:
             warnings.append(UNKNOWN_SIZE.format(subject.distance))
-        if sum(map(len, self.splits.values())) > 1 and are_at_one_place(cameras):
-            warnings.append(ONE_PLACE)
         scene = replace(self, warnings=tuple(warnings), has_nominal_size=self.has_nominal_size and not is_guess)
         if points is not self.points:
             scene = replace(scene, points=None, point_colors=None)

@@ -120,8 +120,10 @@ class _SecondRun(Observer):
         self.data, self.run = data, run
 
     def on_train_start(self, trainer: Trainer) -> None:
-        with pytest.raises(InvalidInput, match="`run` must be a folder in which no other process trains"):
+        with pytest.raises(InvalidInput, match="`run` must be a new folder"):
             fit(small_config(steps=2), self.data, self.run)
+        with pytest.raises(InvalidInput, match="`run` must be a folder in which no other process trains"):
+            fit(small_config(steps=2), self.data, self.run, resume=True)
 
 
 @pytest.mark.usefixtures("no_curve")
@@ -365,7 +367,7 @@ def test_missing_files_are_named(data: Path, run: Path, tmp_path: Path, capsys: 
     (tmp_path / "old" / "run.json").write_text(json.dumps({"data": str(tmp_path / "gone"), "best": None}))
     assert "gone: `folder` does not exist; if it is elsewhere now: msdgs-train eval" in message(tmp_path / "old")
     (tmp_path / "old" / "run.json").write_text("[]")
-    assert "run.json: isn't the record of a run" in message(tmp_path / "old")
+    assert "run.json: is damaged" in message(tmp_path / "old")
     assert cli.main(["eval", str(tmp_path / "old"), "--data", str(data), "--split", "val"]) == cli.EXIT_INVALID
 
 
