@@ -167,7 +167,7 @@ def test_training_goes_on_if_its_output_is_not_read(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     progress = FitProgress(2)
-    monkeypatch.setattr(fit_progress.console, "file", Unread())
+    monkeypatch.setattr(fit_progress.console, "_file", Unread())  # `file` would keep this test's stdout afterwards
     monkeypatch.setattr(fit_progress.console, "on_broken_pipe", lambda: sys.exit(1))  # its own closes the real output
     with progress:
         config = small_config(steps=2)
