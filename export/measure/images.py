@@ -21,7 +21,7 @@ class HeldOutImages:
 
     def __init__(self, folder: Path, info: SceneInfo, begin: Callable[[int], Callable[[], object]]) -> None:
         """Raises `DatasetInvalid` or `InvalidInput` if the folder holds no dataset."""
-        data = load_scene(folder, info.size, info.llffhold, info.time_from).in_frame(info.placement)
+        data = load_scene(folder, info.size, info.llffhold, info.time_from, info.masks).in_frame(info.placement)
         t0, t1 = info.time_range
         self.training: list[Camera] = [frame.camera for frame in data.splits["train"]]
         held_out = [frame for frame in data.splits["test"] or data.splits["val"] if t0 <= frame.t <= t1]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from msdgs_train.datasets import DatasetInvalid, Frame, SceneData, composite, load_scene
+from msdgs_train.datasets.identity import differences, identity
 from msdgs_train.engine.run_record import BEST, MODEL, RECORD, Best, RunInvalid, read_config, read_record
 from msdgs_train.evaluation.metrics import image_metrics, masked_psnr
 from msdgs_train.evaluation.moving_region import moving_region
@@ -63,6 +64,7 @@ class Evaluation(NamedTuple):
     region_source: str  # "images" or "model": the source of the moving region
     masks: list[np.ndarray]  # [H, W] bool per frame, the moving region; the same for all models
     unavailable: dict[str, str]  # scores that could not be computed, with the reason
+    differing: list[str]  # in what the dataset isn't the one of the run
 
 
 def evaluate_run(
@@ -85,6 +87,8 @@ def evaluate_run(
     loaded = {name: load_model(run / FILES[name]) for name in names}
     data = _data_folder(run, data)
     scene = load_scene(data, settings.size, settings.llffhold, settings.time_from, settings.masks)
+    record = read_record(run)
+    differing = differences(record.dataset, identity(scene)) if record else []
     scene = scene.in_frame(loaded["last"].scene.placement)
     frames = _frames(scene, data, split)
     region = moving_region(scene, split, list(loaded.values()))
@@ -98,9 +102,8 @@ def evaluate_run(
             evaluated.images.append(scores(rgb, target, masks[-1], perceptual, frame.load_mask()))
             if progress is not None:
                 progress(index * len(models) + place + 1, len(frames) * len(models))
-    record = read_record(run)
     best = record.best if record and "best" in loaded else None
-    return Evaluation(data, split, frames, models, best, region.source, masks, perceptual.unavailable)
+    return Evaluation(data, split, frames, models, best, region.source, masks, perceptual.unavailable, differing)
 
 
 def scores(

@@ -95,6 +95,8 @@ def notes(evaluation: Evaluation) -> list[str]:
     source = {"images": "the images", "model": "the models"}[evaluation.region_source]
     percent = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
     lines = [f"moving region: {percent:.1f} % of the pixels, determined from {source}; the same for all models."]
+    if evaluation.differing:
+        lines.append(f"data: not as in training; {evaluation.data} differs in {', '.join(evaluation.differing)}.")
     if evaluation.best is not None:
         best = evaluation.best
         lines.append(f"best: highest PSNR on `{best.split}` during training, {best.psnr:.2f} dB.")

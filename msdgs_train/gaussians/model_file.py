@@ -41,6 +41,8 @@ class SceneInfo:
     """Every so many images were held out, as in `DataConfig`."""
     time_from: str | None = None
     """Where times came from, as in `DataConfig`."""
+    masks: bool = True
+    """Whether masks hid pixels, as in `DataConfig`."""
     scene_to_world: dict[str, Any] = field(default_factory=IDENTITY.to_plain)
     """Plain values of the `Similarity` from the frame of the model, bounds and cameras to the user's world."""
 

@@ -153,6 +153,7 @@ class GaussianSplatting:
             llffhold=self.config.data.llffhold,
             scene_to_world=self.scene.scene_to_world.to_plain(),
             time_from=self.config.data.time_from,
+            masks=self.config.data.masks,
         )
 
     def _options(self, step: int) -> RasterizerOptions:

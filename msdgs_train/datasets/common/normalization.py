@@ -28,7 +28,12 @@ MIN_SEEN = 0.5
 OUTWARD_DISTANCE = 12.0
 """Of what cameras show that don't look at one point, in radii of their positions, if nothing else tells. A room whose
 walls are 6 radii away trains to 26.3 dB with 12, 25.5 with 6, 23.7 with 24 and 20.0 with 4."""
-ONE_PLACE = 1e-7
+MAX_DEPTH_RATIO = 30.0
+"""Between depths of points and of what the cameras look at, above which points are taken to have other units, such as
+millimeters for meters. Wide backgrounds have less."""
+MIN_SPREAD = 0.01
+"""Radius of nine tenths of the points, as a fraction of their depth, below which they are taken to have other units."""
+ONE_PLACE = 1e-9
 """Spread of positions, as a fraction of the largest coordinate or of `DISTANCE`, below which they are one place."""
 MAX_POINTS = 20_000
 """About as many points are looked for in each image."""
@@ -85,6 +90,20 @@ def seen_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
         if inside.any():
             depths.append(float(np.median(z[inside])))
     return depths
+
+
+def other_units(cameras: Sequence[Camera], points: np.ndarray) -> str | None:
+    """What tells that points, which cameras see, have other units than the poses; None if nothing does."""
+    subject = find_subject(cameras, None)
+    if not subject.is_looked_at:
+        return None
+    depth = float(np.median(seen_depths(cameras, points)))
+    if not 1 / MAX_DEPTH_RATIO < depth / subject.distance < MAX_DEPTH_RATIO:
+        return f"the points are {depth:.3g} from the cameras, which look at what is {subject.distance:.3g} from them"
+    radius = float(np.quantile(np.linalg.norm(points - np.median(points, axis=0), axis=1), 0.9))
+    if len(points) > 1 and radius < MIN_SPREAD * depth:
+        return f"the points are within {radius:.3g} of each other, and {depth:.3g} from the cameras"
+    return None
 
 
 def are_at_one_place(cameras: Sequence[Camera]) -> bool:

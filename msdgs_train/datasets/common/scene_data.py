@@ -14,10 +14,12 @@ from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import read_rgba, resize_area
 from msdgs_train.datasets.common.masks import WHITE, as_rgba, read_mask
 from msdgs_train.datasets.common.normalization import (
+    MIN_SEEN,
     are_at_one_place,
     are_parallel,
     find_subject,
     normalization,
+    other_units,
     seen_depths,
 )
 from msdgs_train.datasets.common.readers import DatasetInvalid
@@ -30,10 +32,8 @@ ONE_PLACE = (
     "all cameras are at one place, which shows no depth, and only views from there will look right: record with a "
     "camera that moves, or with several"
 )
-UNSEEN_POINTS = (
-    "no camera sees one of the {:,} points, which are left out: give points in the axes and units of the poses, such "
-    "as those of the same COLMAP model"
-)
+SAME_MODEL = "give points in the axes and units of the poses, such as those of the same COLMAP model"
+UNSEEN_POINTS = "{} one of the {:,} points, which are left out: " + SAME_MODEL
 UNKNOWN_SIZE = (
     "the cameras don't look at one point and there are no points, so that the size of the scene is a guess: {:.3g} "
     "around the cameras; --scene-half-size sets it, and COLMAP's points tell it"
@@ -123,9 +123,12 @@ class SceneData:
         if not self.scene_to_world.is_identity:
             return self
         cameras, points, warnings = self.cameras, self.points, list(self.warnings)
-        if points is not None and not seen_depths(cameras, points):
-            warnings.append(UNSEEN_POINTS.format(len(points)))
+        if points is not None and (seen := len(seen_depths(cameras, points))) < MIN_SEEN * len(cameras):
+            who = f"only {seen:,} of {len(cameras):,} cameras see" if seen else "no camera sees"
+            warnings.append(UNSEEN_POINTS.format(who, len(points)))
             points = None
+        if points is not None and (problem := other_units(cameras, points)):
+            warnings.append(f"{problem}: {SAME_MODEL}")
         if sum(map(len, self.splits.values())) > 1 and are_at_one_place(cameras):
             warnings.append(ONE_PLACE)
         if self.has_nominal_size and are_parallel(cameras):
@@ -171,8 +174,8 @@ class SceneData:
         first, last = self.time_range
         if first >= 0 and last <= 1:
             return self
-        length = (last - first) or 1.0
-        return self.retimed(lambda frame: (frame.t - first) / length)
+        half = (last / 2 - first / 2) or 0.5  # the whole length may overflow
+        return self.retimed(lambda frame: (frame.t / 2 - first / 2) / half)
 
     def retimed(self, time: Callable[[Frame], float]) -> "SceneData":
         """The same scene, with another time of each frame."""

@@ -14,7 +14,7 @@ def summary(scene: SceneData) -> str:
     place = scene.scene_to_world
     parts = [
         f"{scene.layout} layout",
-        f"{' + '.join(counts)} images",
+        f"{' + '.join(counts)} " + ("image" if len(frames) == 1 else "images"),
         " and ".join(shown) + (f" and {len(sizes) - 2} other sizes" if len(sizes) > 2 else ""),
         _count(poses, "camera pose"),
         f"{_count(len(times), 'time')} from {first:g} to {last:g}" if len(times) > 1 else "one time",

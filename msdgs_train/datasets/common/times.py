@@ -79,7 +79,8 @@ def _from_names(frames: list[Frame], folder: Path, time_from: str) -> tuple[dict
         elif time_from == NAMES:
             reading = _only_reading(names, frames, folder)
             times = reading.times if reading else (0,) * len(names)
-            warnings = [_photos(reading)] if reading and reading.called == "photo" else []
+            is_photo = reading is not None and reading.called == "photo" and min(reading.times) > 1
+            warnings = [_photos(reading)] if reading and is_photo else []  # frames of a video begin at 0 or 1
         else:
             times = times_by_pattern(names, re.compile(time_from))
     except NameWithoutTime as error:

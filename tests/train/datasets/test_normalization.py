@@ -140,6 +140,36 @@ def test_points_that_no_camera_sees_are_left_out_and_named():
     assert not scene_of(around(), POINTS).normalized().warnings
 
 
+def test_points_that_few_cameras_see_are_left_out_and_counted():
+    first = around()[0]
+    seen_once = first[:3, 3] + 40 * first[:3, 2] + POINTS
+    scene = scene_of([*around(), *around(5.0, -10.0)], seen_once).normalized()
+    assert scene.points is None
+    (warning,) = scene.warnings
+    assert "cameras see one of the 300 points" in warning
+
+
+@pytest.mark.parametrize(("factor", "problem"), [(1000, "look at what is 4 "), (0.001, "within 0.00")])
+def test_points_in_other_units_than_the_poses_are_named(factor: float, problem: str):
+    scene = scene_of(around(), factor * POINTS).normalized()
+    (warning,) = scene.warnings
+    assert problem in warning
+    assert "units of the poses" in warning
+
+
+@pytest.mark.parametrize("factor", [0.1, 1, 10])
+def test_small_objects_and_wide_backgrounds_are_no_other_units(factor: float):
+    assert not scene_of(around(), factor * POINTS).normalized().warnings
+
+
+@pytest.mark.parametrize("count", [1, 5])
+@pytest.mark.parametrize("place", [IDENTITY, PLACES["survey"]])
+def test_one_pose_without_points_has_a_cube_of_a_unit_around_it(count: int, place: Similarity):
+    fixed = placed(scene_of([look_at(np.array([1.9, 2.8, 2.1]), np.zeros(3), UP)] * count), place).normalized()
+    (position,) = {tuple(camera.position) for camera in fixed.cameras}
+    assert fixed.scene_half_size == pytest.approx(np.abs(position).max() + 1)
+
+
 @pytest.mark.parametrize("place", [IDENTITY, PLACES["survey"]])
 def test_cameras_at_one_place_are_named(place: Similarity):
     fixed = placed(scene_of([around()[0]] * 5), place).normalized()

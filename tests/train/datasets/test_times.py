@@ -202,6 +202,16 @@ def test_numbers_of_photos_are_warned_about(tmp_path: Path, form: str):
     assert "--time-from none" in warning_of(scene)
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_frames_of_a_video_that_are_called_as_photos_are_not_warned_about(tmp_path: Path, first: int):
+    assert colmap(tmp_path, *(f"img_{first + index:05}.png" for index in range(3))).warnings == ()
+
+
+def test_times_may_be_as_far_apart_as_floats_are(tmp_path: Path):
+    scene = nerfstudio(tmp_path, "f_0.png", "f_1.png", "f_2.png", times=(-1.7e308, 0.0, 1.7e308))
+    assert sorted(frame.t for frames in scene.splits.values() for frame in frames) == [0.0, 0.5, 1.0]
+
+
 def test_sound_times_are_not_warned_about(tmp_path: Path):
     folders = [tmp_path / name for name in ("dnerf", "neu3d", "hypernerf", "nerfstudio")]
     for folder in folders:
