@@ -96,7 +96,7 @@ def _note_placement(out: Path, metadata: SceneMetadata, console: Console) -> Non
     left = Similarity(place.scale / _written_units(out, metadata), place.offset)
     if left.is_identity or (out.suffix == ONNX and not out.name.endswith(VISIONARY)):
         return
-    where = "in the transform of its node"
+    where = f"in the transform of its {'node' if out.suffix == '.glb' else 'prim'}"
     if out.suffix not in (*USD, ".glb"):
         file = out / PLACEMENT if out.is_dir() else out.with_suffix(f".{PLACEMENT}")
         write_text(file, json.dumps(left.to_plain()) + "\n")
