@@ -120,10 +120,9 @@ class _SecondRun(Observer):
         self.data, self.run = data, run
 
     def on_train_start(self, trainer: Trainer) -> None:
-        with pytest.raises(InvalidInput, match="`run` must be a new folder"):
-            fit(small_config(steps=2), self.data, self.run)
-        with pytest.raises(InvalidInput, match="`run` must be a folder in which no other process trains"):
-            fit(small_config(steps=2), self.data, self.run, resume=True)
+        for resume, expected in ((False, "a new folder"), (True, "a folder in which no other process trains")):
+            with pytest.raises(InvalidInput, match=f"`run` must be {expected}"):
+                fit(small_config(steps=2), self.data, self.run, resume=resume)
 
 
 @pytest.mark.usefixtures("no_curve")
@@ -215,8 +214,7 @@ def _write_fixed_camera(folder: Path) -> Path:
         frames = []
         for t in times:
             pixels = np.full((SIZE, SIZE, 3), 128, np.uint8)
-            x = round(20 * t)
-            pixels[10:14, x : x + 4] = 0
+            pixels[10:14, round(20 * t) : round(20 * t) + 4] = 0
             name = f"{split}/r_{100 * t:03.0f}"
             write_png(folder / f"{name}.png", pixels)
             matrix[0, 3] = -1e-9 * t
