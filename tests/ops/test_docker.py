@@ -116,7 +116,8 @@ def test_the_proxys_limits_follow_those_of_the_service():
     assert limits["render_seconds"].default < seconds < 2 * limits["render_seconds"].default
     assert f"client_max_body_size {limits['max_body_bytes'].default >> 20}m;" in settings
     (idle,) = {float(each) for each in re.findall(r"keepalive_timeout (\d+)s;", settings)}
-    assert idle < Config("").timeout_keep_alive, "nginx closes idle connections, not the service during a request"
+    service = Config("", log_config=None)  # the default would set up logging for all tests
+    assert idle < service.timeout_keep_alive, "nginx closes idle connections, not the service during a request"
     assert seconds_of(SERVICES["proxy"]["stop_grace_period"]) > seconds
     assert seconds_of(SERVICES["render"]["stop_grace_period"]) > limits["drain_seconds"].default
 
