@@ -119,7 +119,7 @@ class SceneData:
         return list({camera.camera_to_world.tobytes(): camera for camera in every}.values())
 
     def normalized(self) -> "SceneData":
-        """The same scene in the frame that it is trained in, without points that no camera sees."""
+        """The same scene in the frame that it is trained in, without points that fewer than half of the cameras see."""
         if not self.scene_to_world.is_identity:
             return self
         cameras, points, warnings = self.cameras, self.points, list(self.warnings)
@@ -155,9 +155,9 @@ class SceneData:
 
         points = None if self.points is None else scene_to_world.to_scene(own.to_world(self.points))
         scene = replace(self._with_each(moved), points=points, scene_to_world=scene_to_world)
-        return (
-            scene if self.has_nominal_size else replace(scene, scene_half_size=scene_half_size(points, scene.cameras))
-        )
+        if self.has_nominal_size:
+            return scene
+        return replace(scene, scene_half_size=scene_half_size(points, scene.cameras))
 
     @cached_property
     def time_range(self) -> tuple[float, float]:
