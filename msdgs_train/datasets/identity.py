@@ -24,6 +24,7 @@ PARTS = {
     "times": "times",
     "cameras": "cameras",
     "files": "contents of images",
+    "masks": "masks",
 }
 """The parts of an identity, and what differs for people where one does."""
 
@@ -45,12 +46,15 @@ def identity(scene: SceneData) -> dict[str, Any]:
     splits = [(split, frame) for split in SPLITS for frame in scene.splits.get(split, ())]
     frames = [frame for _, frame in splits]
     files = dict.fromkeys(file for frame in frames for file in frame.files)
+    masked = [(index, file) for index, frame in enumerate(frames) if (file := frame.mask_path)]
+    masks = {file: _contents(file) for file in {file for _, file in masked}}
     return {
         "images": len(frames),
         "names": _digest([[split, unicodedata.normalize("NFC", frame.name)] for split, frame in splits]),
         "times": _digest(_rounded([frame.t for frame in frames])),
         "cameras": _digest(list(_cameras(frames))),
         "files": _digest([_contents(file) for file in files]),
+        "masks": _digest([[index, masks[file]] for index, file in masked]),
     }
 
 

@@ -87,6 +87,13 @@ def leave_out_an_image(folder: Path) -> None:
     edited(folder, lambda contents: contents["frames"].pop())
 
 
+def hide_a_pixel(folder: Path) -> None:
+    pixels = np.full_like(read_rgba(folder / "train" / "r_003.png"), 255)
+    pixels[11, 5, :3] = 0
+    write_png(folder / "mask.png", pixels)
+    edited(folder, lambda contents: contents["frames"][3].update(mask_path="mask.png"))
+
+
 @pytest.mark.parametrize(
     ("edit", "told"),
     [
@@ -97,6 +104,7 @@ def leave_out_an_image(folder: Path) -> None:
         (zoom, {"cameras"}),
         (change_a_time, {"times"}),
         (rename_an_image, {"names of images or splits"}),
+        (hide_a_pixel, {"masks"}),
         (order_by_time_backwards, {"names of images or splits", "times", "cameras", "contents of images"}),
         (
             leave_out_an_image,
@@ -137,6 +145,16 @@ def test_last_digits_are_the_machines_own_and_others_count(original: Path, dista
     assert not differences(identity(far), identity(computed))
     nudged = moved(far, lambda pose: shifted(pose, step), far.splits["train"][3].name)
     assert differences(identity(far), identity(nudged)) == ["cameras"]
+
+
+def test_other_masks_are_told(copy: Path):
+    hide_a_pixel(copy)
+    one, pixels = load_scene(copy), read_rgba(copy / "mask.png")
+    before = identity(one)
+    pixels[:9, 5, :3] = 0
+    write_png(copy / "mask.png", pixels)
+    assert differences(before, identity(load_scene(copy))) == ["masks"]
+    assert differences(before, identity(one.without_masks())) == ["masks"]
 
 
 def test_a_missing_image_is_named(copy: Path):
