@@ -20,15 +20,15 @@ from benchmarks.export.paper_sized import resized
 from benchmarks.measuring import Times, machine, report_console, table
 from export.jobs.job import Candidate, ExportJob
 from export.jobs.store import stored
+from export.jobs.verify import TIMES, verify
 from export.jobs.write import properties
 from export.measure.poses import posed
 from export.measure.rendered_error import RenderedError
-from export.measure.stability import MIN_PSNR
-from export.measure.verify import TIMES, verify
 from export.plans.base import BASELINE
 from export.plans.registry import build
 from export.pruning.mask import PruningMask, bake_pruned, full_mask, pruned
 from export.storage.choice import GROUPS, packed
+from export.target import MIN_PSNR
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.threads import THREADS_VARIABLE

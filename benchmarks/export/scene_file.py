@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.progress import track
 
 from benchmarks.measuring import Times, machine, report_console, table
-from export.jobs.bake import bake
+from export.bake import bake
+from export.jobs.frame_memory import frame_memory
 from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES
-from export.measure.frame_memory import frame_memory
 from export.measure.frames import compare, render
 from export.measure.poses import in_float64
 from export.measure.rendered_error import by_time

@@ -19,10 +19,10 @@ from export.importers.sequence import of_the_moment
 from export.importers.splats.formats import read_splats
 from export.jobs.store import stored_anew
 from export.jobs.write import set_properties, storage_differences, write_measured
-from export.measure.stability import MIN_PSNR
 from export.options import ConvertOptions, require_folder_of
 from export.plans.registry import PLANS
 from export.progress import tracked
+from export.target import MIN_PSNR
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT

@@ -17,9 +17,9 @@ from export.importers.sequence import posed, read_sequence, sequence_scene, show
 from export.importers.splats.axes import up_direction
 from export.importers.splats.formats import READERS, read_splats, refuse_pointer
 from export.importers.splats.sog import META
-from export.measure.stability import MIN_PSNR
 from export.options import ExportOptions, require_folder_of
 from export.progress import tracked
+from export.target import MIN_PSNR
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import scratch_folder

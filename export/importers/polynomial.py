@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import onnx
 
+from export.bake import Baked, Moving
 from export.importers.scene import metadata_of
 from export.importers.splats.base import Splats, as_float32
 from export.importers.splats.spacetime import Spacetime
-from export.jobs.bake import Baked, Moving
 from export.plans.scene_graph import activated, changing_output, finished, new_graph
 from export.trajectories.poses import POSE
 from msdgs_serve.scene.baked import BakedScene

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import onnx
 
+from export.bake import Baked, Moving
 from export.importers.placement import placement
 from export.importers.splats.base import Splats
-from export.jobs.bake import Baked, Moving
 from export.jobs.store import stored_anew
 from export.jobs.write import properties, set_properties, storage_differences, write_measured
 from export.measure.poses import half_diagonal

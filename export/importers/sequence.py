@@ -16,13 +16,13 @@ import onnx
 from onnx import TensorProto
 from scipy.spatial import KDTree
 
+from export.bake import Baked, Moving
 from export.importers.detect import frame_files
 from export.importers.errors import ImportFailed
 from export.importers.placement import placement
 from export.importers.scene import UP, metadata_of
 from export.importers.splats.base import Splats
 from export.importers.splats.formats import read_splats
-from export.jobs.bake import Baked, Moving
 from export.measure.poses import half_diagonal
 from export.plans.scene_graph import activated, changing_output, finished, new_graph
 from export.trajectories.poses import POSE

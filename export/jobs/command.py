@@ -11,9 +11,9 @@ import onnx
 from rich.console import Console
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, ExportJob, TargetNotReached
+from export.jobs.job import Candidate, ExportJob
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
-from export.jobs.store import METADATA_BYTES, PLAN_PART, UNUSABLE, check_min_psnr, squared, stored, within_bytes
+from export.jobs.store import METADATA_BYTES, UNUSABLE, stored, within_bytes
 from export.jobs.sweep import Sweep, as_stored, pruning_levels
 from export.jobs.write import Exported, write_scene
 from export.measure.rendered_error import RenderedError
@@ -21,6 +21,7 @@ from export.options import ExportOptions
 from export.plans.registry import parse
 from export.progress import Track, tracked
 from export.pruning import RULES
+from export.target import PLAN_PART, TargetNotReached, check_min_psnr, squared
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.gaussians.model_file import load_model

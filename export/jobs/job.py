@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from export.jobs.bake import Baked, changing_outputs
+from export.bake import Baked, changing_outputs
 from export.layers import HEADS
 from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames, RenderedError, within_memory
-from export.measure.stability import MIN_PSNR, StabilityReport, assess
 from export.measure.views import cameras_of, evaluation_views, selection_views
 from export.plans.base import BASELINE
 from export.plans.registry import build, check_appearance, plan_of
+from export.plans.single_poses import SinglePoses
+from export.precision.assess import StabilityReport, assess
 from export.progress import Track, no_progress
 from export.pruning import RULES, PrunedModel, PruningMask, PruningStatistics, full_mask, prune, pruned
 from export.pruning.mask import NetworkMask, bake_pruned, in_spatial_order, rows, unpruned, with_layers, with_sh_degree
-from export.trajectories.poses import SinglePoses
+from export.target import ADDED_DB, MIN_PSNR
 from export.trajectories.sampling import Sampler, Trajectories, layers_digest
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
@@ -39,9 +40,6 @@ SELECTION_TIMES, SELECTION_CAMERAS = 33, 3
 ESTIMATE_STRIDE = 7
 """A quick estimate compares every 7th frame: no multiple of `CAMERAS_PER_TIME`, so not always the first of a time."""
 
-ADDED_DB = 0.05
-"""What an export may add to the error against held-out images, dB, if no `min_psnr` is given."""
-
 BACK_OFFS = 4
 """Repeats of pruning with a smaller error, if its rules together cost more than each of them alone."""
 
@@ -52,15 +50,6 @@ ROUND_OFF_DB = 30.0
 
 SAMPLED_KEPT = 2
 """Sets of trajectories that are cached; one takes up to 2 GiB."""
-
-
-class TargetNotReached(InvalidInput):
-    """No export of this model reaches the PSNR, or is as small, as was asked for."""
-
-    @classmethod
-    def psnr(cls, reached: float, where: str, asked: float) -> "TargetNotReached":
-        """Where the worst frame reached another PSNR, dB."""
-        return cls("min_psnr", f"at most {math.floor(10 * reached) / 10:.1f}, which {where} on its worst frame", asked)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ from typing import Any
 
 from export.jobs.figure import draw
 from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, ExportJob
-from export.jobs.store import squared
 from export.jobs.sweep import SweepResult
 from export.measure.machine import processor
 from export.plans.base import BASELINE
+from export.target import squared
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
 from msdgs_serve.writing import replacing, write_text

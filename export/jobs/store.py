@@ -10,21 +10,15 @@ from typing import TypeVar
 import numpy as np
 import onnx
 
-from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob, TargetNotReached
+from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob
 from export.jobs.write import properties, set_properties
 from export.measure.rendered_error import ExactFrames, RenderedError, within_memory
 from export.measure.views import cameras_of_file, evaluation_views
 from export.storage.choice import COARSEST, Stored, fewest_bytes, packed, smallest_error
+from export.target import TargetNotReached, check_min_psnr, squared
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
-from msdgs_train.evaluation.metrics import MAX_PSNR
-
-PLAN_PART = 0.75
-"""Of the squared error that a file may have, the part that plan and pruning may use."""
-
-LOWEST_MIN_PSNR = 10.0
-"""Smallest `min_psnr`, dB. Frames below it don't resemble the scene."""
 
 METADATA_BYTES = 3000
 """Bytes that are kept free for what is measured last and added to the metadata of the written file."""
@@ -122,18 +116,6 @@ def min_bytes(job: ExportJob, candidate: Candidate) -> int:
     """Size of the smallest file in which a candidate can be written."""
     size = packed(onnx.load(candidate.path), COARSEST).ByteSize() if job.packs else candidate.size
     return size + METADATA_BYTES
-
-
-def squared(psnr: float) -> float:
-    """Squared error of a frame of this PSNR, dB."""
-    return 10 ** (-psnr / 10)
-
-
-def check_min_psnr(min_psnr: float) -> None:
-    """Raise `InvalidInput` for a minimum PSNR, dB, that no file reaches or whose frames don't resemble the scene."""
-    if not (math.isfinite(min_psnr) and LOWEST_MIN_PSNR <= min_psnr <= MAX_PSNR):
-        allowed = f"a PSNR in dB from {LOWEST_MIN_PSNR:g} to {MAX_PSNR:g}; at 50 no difference is visible"
-        raise InvalidInput("min_psnr", allowed, min_psnr)
 
 
 def _in_fewer_bits(

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 from operator import le
 from typing import Any, NamedTuple
 
-from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
-from export.jobs.store import PLAN_PART, min_bytes, nothing_left, usable, within_bytes
-from export.measure.frame_memory import frame_memory
+from export.jobs.frame_memory import frame_memory
+from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob
+from export.jobs.store import min_bytes, nothing_left, usable, within_bytes
+from export.jobs.timing import FrameTime, time_frame, time_frames
 from export.measure.rendered_error import RenderedError
-from export.measure.timing import FrameTime, time_frame, time_frames
 from export.plans.base import BASELINE
 from export.plans.registry import PLANS, parse, plan_of
+from export.target import PLAN_PART, TargetNotReached
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
 

@@ -9,7 +9,7 @@ from typing import Any
 import onnx
 from onnx import helper
 
-from export.measure.verify import TIMES, TOLERANCE, differences, verify
+from export.jobs.verify import TIMES, TOLERANCE, differences, verify
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene, SceneMetadata
 from msdgs_serve.writing import replacing

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from export.jobs.bake import starting_cameras
+from export.bake import starting_cameras
 from export.measure.poses import usable_rows
 from export.measure.views import cameras_of
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, rasterize

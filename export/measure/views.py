@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from export.measure.verify import times_to_verify
+from export.measure.times import times_to_verify
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.metadata import SceneCamera, SceneMetadata
 from msdgs_train.gaussians.bounds import first_by_pose

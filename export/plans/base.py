@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import onnx
 
-from export.jobs.bake import Baked
+from export.bake import Baked
 
 if TYPE_CHECKING:
     from export.trajectories.sampling import Trajectories

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import onnx
 from onnx import TensorProto
 
-from export.jobs.bake import Baked
+from export.bake import Baked
 from export.layers.graph import GraphBuilder
 from export.plans.base import Plan, PlanSpec
 from export.plans.scene_graph import activated, finished

@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from export.jobs.bake import Baked
+from export.bake import Baked
 from export.layers.base import heads_of
 from export.layers.graph import GraphBuilder
 from export.plans.base import Plan

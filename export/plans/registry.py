@@ -5,7 +5,7 @@ from collections.abc import Collection
 
 import onnx
 
-from export.jobs.bake import Baked
+from export.bake import Baked
 from export.plans.base import Plan, PlanSpec
 from export.plans.compact import COMPACT
 from export.plans.network import NETWORK, PREFIX

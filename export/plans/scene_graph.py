@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from export.jobs.bake import Baked
+from export.bake import Baked
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, CONTRACT, BakedScene, constant_outputs
 from msdgs_serve.scene.metadata import CHANGING_CONTRACT

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from export.measure.amplification import UNIT_ROUNDOFF
-from export.measure.stability import assess
+from export.precision.assess import assess
 from export.precision.formats import FORMATS
 from export.precision.report import StabilityReport, WorstGaussians
 from export.progress import tracked

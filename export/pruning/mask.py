@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from export.jobs.bake import Baked, bake
+from export.bake import Baked, bake
 from export.layers import export_of
 from export.measure.poses import posed
 from export.spatial_order import morton_order

@@ -7,7 +7,7 @@ from functools import cached_property, partial, reduce
 import numpy as np
 import torch
 
-from export.jobs.bake import changing_outputs
+from export.bake import changing_outputs
 from export.measure.frames import compare, render
 from export.measure.poses import Pose, operations, posed
 from export.measure.views import View

@@ -1,4 +1,4 @@
-"""Poses of the moving Gaussians of a baked scene, in float64 by torch and in float32 by onnxruntime."""
+"""Poses of the moving Gaussians of a baked scene, in float64 by torch."""
 
 import copy
 
@@ -6,12 +6,9 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from export.jobs.bake import DELTA_SPACES, Baked
+from export.bake import DELTA_SPACES, Baked
 from export.layers import HEAD_COLUMNS, HEADS
 from export.measure.poses import operations
-from export.plans.network import network
-from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.scene.gaussians import FloatArray
 from msdgs_train.gaussians.scale_space import ScaleSpace, add_to_scales
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.layers.quaternions import unit_or_identity
@@ -58,18 +55,3 @@ class ExactPoses:
         )
         scales = add_to_scales(self._space, log_scales, of_scales)
         return torch.cat([means + of_means, scales, unit_or_identity(quats + of_quats)], dim=1).numpy()
-
-
-class SinglePoses:
-    """Poses in float32 by onnxruntime, in 0.6 of torch's time for ten layers of 256 units on two cores.
-
-    Raises `SceneFileInvalid` if float32 can't hold the scene or its motion.
-    """
-
-    def __init__(self, baked: Baked) -> None:
-        self._session = DeformationSession("network in float32", contents=network(baked).SerializeToString())
-
-    def at(self, t: float, ids: npt.NDArray[np.int64]) -> FloatArray:
-        """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`."""
-        means, quats, scales = self._session.pose(t, ids)
-        return np.concatenate([means, scales, quats], axis=1)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from export.jobs.bake import Baked
+from export.bake import Baked
 from export.measure.views import cameras_of_file
 from export.progress import Track, no_progress
 from export.trajectories.poses import POSE, QUATS, ExactPoses

@@ -23,5 +23,5 @@ def few_candidates() -> Iterator[None]:
         ):
             patch.setattr(f"export.jobs.job.{name}", value)
         patch.setattr("export.jobs.store.EVALUATION_TIMES", 6)
-        patch.setattr("export.measure.timing.REPEATS", 3)
+        patch.setattr("export.jobs.timing.REPEATS", 3)
         yield

@@ -13,7 +13,7 @@ import numpy as np
 import onnx
 import torch
 
-from export.jobs.bake import bake
+from export.bake import bake
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed
 from export.plans.registry import build
 from export.precision.formats import FLOAT32, in_format
@@ -46,7 +46,7 @@ def exported(model: DynamicGaussians, scene: SceneInfo = SCENE) -> DeformationSe
 
 def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: DeformationSession | None = None) -> float:
     """Return the largest error of the file's poses against the model in float64, at both ends and between, as
-    `export.measure.verify` measures it."""
+    `export.jobs.verify` measures it."""
     session = session or exported(model, scene)
     double, worst = in_format(model, FLOAT32).double(), 0.0
     for t in (scene.time_range[0], sum(scene.time_range) / 2, scene.time_range[1]):

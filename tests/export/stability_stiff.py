@@ -10,7 +10,7 @@ import torch
 
 from export.measure.amplification import through_layers
 from export.measure.poses import posed
-from export.measure.stability import assess
+from export.precision.assess import assess
 from export.precision.formats import FLOAT32, in_format
 from export.precision.report import StabilityReport
 from msdgs_train.gaussians.model import DynamicGaussians

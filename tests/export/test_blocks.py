@@ -7,8 +7,8 @@ import pytest
 import torch
 from onnx import numpy_helper
 
+from export.bake import bake
 from export.importers.sequence import Frames, sequence_scene
-from export.jobs.bake import bake
 from export.plans.registry import build
 from export.spatial_order import morton_order
 from export.supports.blocks import block_layout

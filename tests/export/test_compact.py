@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.jobs.bake import bake
+from export.bake import bake
 from export.measure.poses import posed
 from export.measure.views import cameras_of
 from export.plans import compact

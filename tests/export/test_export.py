@@ -14,12 +14,13 @@ import pytest
 import torch
 from rich.console import Console
 
+from export.bake import bake, starting_cameras
 from export.exporters.command import convert
 from export.importers.command import model_or_import
-from export.jobs.bake import bake, starting_cameras
+from export.jobs.verify import VerificationFailed, verify
 from export.layers.graph import GraphBuilder
 from export.measure.images import HeldOutImages
-from export.measure.verify import VerificationFailed, times_to_verify, verify
+from export.measure.times import times_to_verify
 from export.options import ConvertOptions, ExportOptions
 from export.plans.registry import build
 from export.to_onnx import main as to_onnx

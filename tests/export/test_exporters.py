@@ -16,6 +16,7 @@ from onnx import TensorProto, numpy_helper
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from export.bake import bake
 from export.exporters import gltf
 from export.exporters.command import LOSSLESS, LOSSY, convert
 from export.exporters.gltf import EXTENSION, read_gltf, write_gltf
@@ -25,7 +26,6 @@ from export.exporters.usd import read_usd
 from export.exporters.visionary import visionary_model
 from export.importers.sequence import Frames, read_sequence, sequence_scene
 from export.importers.splats.formats import read_splats
-from export.jobs.bake import bake
 from export.options import ConvertOptions
 from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession

@@ -13,13 +13,13 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from export.bake import bake
 from export.importers.command import model_or_import
 from export.importers.detect import detect_format
 from export.importers.errors import ImportFailed
 from export.importers.runs import base
 from export.importers.runs.fidelity import as_trained
 from export.importers.runs.model import write_model
-from export.jobs.bake import bake
 from export.measure.poses import posed
 from export.options import ExportOptions
 from export.plans.registry import build

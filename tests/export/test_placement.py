@@ -11,10 +11,10 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
+from export.bake import bake
 from export.exporters.command import convert
 from export.exporters.gltf import read_gltf
 from export.importers.splats.formats import read_splats
-from export.jobs.bake import bake
 from export.options import ConvertOptions
 from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession

@@ -12,13 +12,14 @@ import onnx
 import pytest
 import torch
 
-from export.jobs.bake import Baked, bake
+from export.bake import Baked, bake
+from export.jobs.verify import verify
 from export.layers import HEAD_COLUMNS, LAYERS, ModelNotExportable
 from export.layers.chain import summed_deltas
 from export.layers.graph import GraphBuilder
 from export.measure.poses import in_float64
 from export.measure.rendered_error import ExactFrames
-from export.measure.verify import times_to_verify, verify
+from export.measure.times import times_to_verify
 from export.measure.views import cameras_of, evaluation_views
 from export.plans.base import Plan
 from export.plans.network import network

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from export.jobs.bake import Baked, bake
+from export.bake import Baked, bake
 from export.plans.registry import build
 from export.trajectories import sampling as module
 from export.trajectories.poses import ExactPoses

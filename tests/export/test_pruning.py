@@ -10,8 +10,8 @@ import onnx
 import pytest
 import torch
 
+from export.bake import Baked
 from export.jobs import job as jobs
-from export.jobs.bake import Baked
 from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob
 from export.jobs.write import write_scene
 from export.measure.poses import posed

@@ -7,13 +7,14 @@ from typing import Any, cast
 
 import pytest
 
-from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob, TargetNotReached
+from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob
 from export.jobs.store import within_bytes
 from export.jobs.sweep import Sweep
 from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
 from export.plans.registry import PLANS
+from export.target import TargetNotReached
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions

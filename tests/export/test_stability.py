@@ -11,7 +11,7 @@ import torch
 
 from export.measure.frames import PoseRenderer, compare
 from export.measure.poses import posed
-from export.measure.stability import assess
+from export.precision.assess import assess
 from export.precision.formats import FLOAT32, FORMATS, in_format
 from export.precision.report import PlanUnsafe
 from export.stability import UNSTABLE, main

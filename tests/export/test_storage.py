@@ -12,10 +12,10 @@ import pytest
 import torch
 from onnx import TensorProto
 
+from export.bake import bake
 from export.convert import main as convert_main
 from export.exporters.round_trip import RoundTrip
 from export.importers.sequence import Frames, sequence_scene
-from export.jobs.bake import bake
 from export.jobs.job import ExportJob
 from export.jobs.write import properties, set_properties
 from export.layers.graph import GraphBuilder

@@ -15,9 +15,9 @@ from PIL import Image
 from export.jobs.job import ExportJob
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
 from export.jobs.sweep import TIME_MARGIN, Point, QuickEstimate, Sweep, SweepResult, choose, front
+from export.jobs.timing import FrameTime, Milliseconds
 from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
-from export.measure.timing import FrameTime, Milliseconds
 from export.options import ExportOptions
 from export.pruning import RULES
 from export.to_onnx import main

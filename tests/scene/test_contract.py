@@ -10,7 +10,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from export.jobs.bake import bake
+from export.bake import bake
 from export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, MOVING_OUTPUTS, SceneMetadata

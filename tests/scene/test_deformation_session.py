@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from export.jobs.bake import bake
+from export.bake import bake
 from export.plans.registry import build
 from msdgs_serve import deformation
 from msdgs_serve.deformation import DeformationSession

@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from export.jobs.bake import bake
+from export.bake import bake
+from export.jobs.verify import TIMES, TOLERANCE
 from export.jobs.write import Exported, write_scene
-from export.measure.stability import assess
-from export.measure.verify import TIMES, TOLERANCE
 from export.plans.base import BASELINE
 from export.plans.registry import build
+from export.precision.assess import assess
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians

@@ -6,8 +6,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from export.bake import bake
 from export.importers.sequence import Frames, sequence_scene
-from export.jobs.bake import bake
 from export.plans.registry import build
 from export.storage.choice import COARSEST, GROUPS, packed
 from export.trajectories.sampling import Trajectories

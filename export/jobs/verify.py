@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed
+from export.measure.times import times_to_verify
 from export.plans.base import BASELINE
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import APPEARANCE
@@ -121,15 +122,6 @@ def _distances(got: Gaussians, expected: Gaussians) -> np.ndarray:
 def _give_sign_of(quats: np.ndarray, changed: np.ndarray) -> None:
     """Flip the signs of quaternions to those nearer to `quats`: q and −q are one rotation."""
     changed *= np.where((quats * changed).sum(axis=1, keepdims=True) < 0, -1, 1).astype(changed.dtype)
-
-
-def times_to_verify(t0: float, t1: float, count: int) -> list[float]:
-    """`count` float32 times in [t0, t1]: both ends, and irregular times between them."""
-    golden = (math.sqrt(5) - 1) / 2
-    inner = sorted((i * golden) % 1 for i in range(1, count - 1))
-    rounded = (float(np.float32(t0 + (t1 - t0) * f)) for f in inner)
-    # the float32 neighbors of t0 and t1 may lie outside the range
-    return [t0, *(min(max(t, t0), t1) for t in rounded), t1]
 
 
 def _posed_by_file(session: DeformationSession, t: float, ids: np.ndarray) -> Gaussians:

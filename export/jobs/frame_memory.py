@@ -30,7 +30,7 @@ EAGER = {"MALLOC_MMAP_THRESHOLD_": "65536", "MALLOC_TRIM_THRESHOLD_": "0", "MALL
 def frame_memory(paths: Sequence[Path], view: SceneCamera, track: Track) -> list[int | None]:
     """Peak bytes of loading each file and drawing one of its frames, above the memory of the process before."""
     request = json.dumps({"paths": [str(path.resolve()) for path in paths], "view": view.to_plain()})
-    command = [sys.executable, "-m", "export.measure.frame_memory", request]
+    command = [sys.executable, "-m", "export.jobs.frame_memory", request]
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     on_file, found = track("memory of a frame", len(paths) + 1), list[int | None]()
     with subprocess.Popen(

@@ -14,17 +14,15 @@ import torch
 from export.measure.amplification import Growth, growth
 from export.measure.frames import NEAR, FrameDifference, PoseRenderer, compare
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed, usable_rows
-from export.measure.verify import times_to_verify
+from export.measure.times import times_to_verify
 from export.precision.formats import FLOAT32, Format, in_format
 from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians, limits_met
 from export.progress import Track, no_progress
+from export.target import MIN_PSNR
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
-
-MIN_PSNR = 50.0
-"""dB. Errors above it are invisible: the default of an export."""
 
 TIMES = 20
 SAMPLED = 2_000
