@@ -9,8 +9,8 @@ import pytest
 from msdgs_serve.rasterizer import vector_memory as memory
 from msdgs_serve.rasterizer import vector_squares, vectors
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
-from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial, log2
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.simd.exponential import exp2, exp2_polynomial, log2
 from tests.support.tolerances import assert_close
 
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float32", "float64"])
