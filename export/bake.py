@@ -14,7 +14,7 @@ from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.layers.arrays import to_array
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.quaternions import unit_or_identity
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.gaussians import GaussiansConfig

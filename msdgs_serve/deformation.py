@@ -60,6 +60,13 @@ class DeformationSession:
         """Number of deformation layers that `pose` can apply one by one; 0 if the scene's plan doesn't run layers."""
         return 0 if self._steps is None else len(self.scene.metadata.layers)
 
+    def check_time(self, t: float, field: str = "t") -> None:
+        """Raise `InvalidInput` if a time is outside the scene's range; `field` is `t`, or what was added to `t`."""
+        t0, t1 = self.scene.metadata.time_range
+        if not t0 <= t <= t1:
+            expected = f"in the scene's range [{t0}, {t1}]"
+            raise InvalidInput(field, expected if field == "t" else f"such that t + {field} is {expected}", t)
+
     def check_steps(self, steps: float | None) -> None:
         """Raise `InvalidInput` if the scene can't be posed after `steps` layers."""
         if steps is None:
@@ -79,7 +86,7 @@ class DeformationSession:
         Raises `InvalidInput` for a time outside the scene's range and for invalid ids or steps, and `SceneFileInvalid`
         if the deformation overflows.
         """
-        t = self._checked_time(t)
+        self.check_time(t)
         self.check_steps(steps)
         ids = None if ids is None else self._checked_ids(ids)
         with sharing_cores():
@@ -130,12 +137,6 @@ class DeformationSession:
             if output.shape[1:] != tuple(row) or len(output) < count:
                 raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {(count, *row)}")
         return {name: output[rows] for name, output in outputs.items()}
-
-    def _checked_time(self, t: float) -> float:
-        t0, t1 = self.scene.metadata.time_range
-        if not t0 <= t <= t1:
-            raise InvalidInput("t", f"in the scene's range [{t0}, {t1}]", t)
-        return t
 
     def _checked_ids(self, ids: npt.ArrayLike) -> npt.NDArray[np.int64]:
         array = np.asarray(ids)

@@ -1,6 +1,5 @@
 """Render a scene at a time, with a camera, to an image. Independent of HTTP."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -147,24 +146,16 @@ def check_times(
     session: DeformationSession, t: float, shutter: Shutter | None = None, motion_dt: float | None = None
 ) -> None:
     """Raise `InvalidInput`, naming the field, for times outside the scene's range, or motion of switched frames."""
-    first, last = session.scene.metadata.time_range
     if shutter is not None and motion_dt is not None:
         raise InvalidInput("shutter", "left out if motion is drawn", "given")
     if motion_dt is not None and session.scene.metadata.is_switched:
         raise InvalidInput("dt", "left out: this scene switches from frame to frame, nothing moves", motion_dt)
-    for field, time in _times(t, shutter, motion_dt):
-        if not first <= time <= last:
-            expected = f"in the scene's range [{first}, {last}]"
-            raise InvalidInput(field, expected if field == "t" else f"such that t + {field} is {expected}", time)
-
-
-def _times(t: float, shutter: Shutter | None, motion_dt: float | None) -> Iterator[tuple[str, float]]:
-    yield "t", t
+    session.check_time(t)
     if motion_dt is not None:
-        yield "dt", t + motion_dt
+        session.check_time(t + motion_dt, "dt")
     if shutter is not None:
-        yield "shutter.open", t + shutter.open
-        yield "shutter.close", t + shutter.close
+        session.check_time(t + shutter.open, "shutter.open")
+        session.check_time(t + shutter.close, "shutter.close")
 
 
 def resolve_background(session: DeformationSession, background: Background) -> Color:

@@ -14,7 +14,7 @@ from rich.progress import track
 from benchmarks.measuring import Times, machine, minimum_and_median, psnr, report_console, table
 from benchmarks.rasterizer.scenes import SH_DEGREE, object_camera, object_scene
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, alpha, rasterize
-from msdgs_serve.rasterizer.exponential import exp2_polynomial
+from msdgs_serve.rasterizer.simd.exponential import exp2_polynomial
 from msdgs_serve.scene import Camera, Gaussians
 from tests.support.reference import render
 

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.vector_memory import load, store
-from msdgs_serve.rasterizer.vector_types import NUM_LANES
-from msdgs_serve.rasterizer.vectors import fma, spread
+from msdgs_serve.rasterizer.simd.memory import load, store
+from msdgs_serve.rasterizer.simd.types import NUM_LANES
+from msdgs_serve.rasterizer.simd.vectors import fma, spread
 from msdgs_serve.threads import run_parallel, split_evenly, thread_count
 
 FLOPS_PER_PAIR = 37

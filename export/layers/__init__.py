@@ -7,7 +7,7 @@ from export.layers.base import HEAD_COLUMNS, HEADS, LayerExport, LayerInputs, Mo
 from export.layers.mlp import MLPExport
 from export.layers.plane import PlaneExport
 from export.layers.spline import SplineExport
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 
 __all__ = ["HEADS", "HEAD_COLUMNS", "LAYERS", "LayerExport", "LayerInputs", "ModelNotExportable", "export_of"]
 

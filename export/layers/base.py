@@ -7,8 +7,7 @@ import torch
 
 from export.layers.graph import GraphBuilder
 from msdgs_serve.scene.errors import MsdgsError
-from msdgs_train.layers.base import HEAD_COLUMNS, PAPER_HEADS, Heads
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import HEAD_COLUMNS, PAPER_HEADS, DeformationLayer, Heads
 
 HEADS = tuple(HEAD_COLUMNS)
 """The heads of poses. Others, of opacities and SH, are named as the outputs of a scene file."""

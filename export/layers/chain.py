@@ -7,7 +7,7 @@ import numpy as np
 from export.layers import export_of
 from export.layers.base import HEADS, LayerInputs, heads_of
 from export.layers.graph import GraphBuilder
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 
 STRETCH_COLUMNS = 6
 """Columns of a symmetric matrix, in which control nodes sum stretches; the first three are its diagonal."""

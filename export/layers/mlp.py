@@ -8,7 +8,7 @@ import torch
 
 from export.layers.base import HEAD_COLUMNS, FieldLayerExport, LayerInputs, heads_of, zero
 from export.layers.graph import GraphBuilder, affine, to_numpy
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.mlp import MLPLayer
 
 

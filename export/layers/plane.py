@@ -9,7 +9,7 @@ from onnx import TensorProto
 
 from export.layers.base import HEADS, FieldLayerExport, LayerInputs, heads_of, zero
 from export.layers.graph import GraphBuilder, affine, to_numpy
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 
 FIRST_AXES = np.array([0, 0, 1], np.int64)  # of the planes xy, xz, yz

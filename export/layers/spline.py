@@ -7,7 +7,7 @@ from onnx import TensorProto
 
 from export.layers.base import HEADS, LayerInputs
 from export.layers.graph import GraphBuilder, to_numpy
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.spline import SplineLayer
 
 KNOTS = 4

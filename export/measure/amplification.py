@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from msdgs_train.gaussians.model import DynamicGaussians, canonical_points
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.chain import MultiStepDeformation
-from msdgs_train.layers.deformation import DeformationLayer
 
 UNIT_ROUNDOFF = 2.0**-24
 """Largest relative error of one rounding to float32."""

@@ -17,8 +17,8 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.layers.arrays import to_array
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.chain import MultiStepDeformation
-from msdgs_train.layers.deformation import DeformationLayer
 
 
 @dataclass(frozen=True)

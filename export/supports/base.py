@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from export.layers.graph import GraphBuilder
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.supports.base import Support
 
 

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.simd.exponential import exp2, exp2_polynomial
+from msdgs_serve.rasterizer.simd.types import Vector
+from msdgs_serve.rasterizer.simd.vectors import filled, fma, minimum, select, spread
 from msdgs_serve.rasterizer.splats import LOG2_OPACITY, ROOT_A, ROOT_B, ROOT_C, X, Y
-from msdgs_serve.rasterizer.vector_types import Vector
-from msdgs_serve.rasterizer.vectors import filled, fma, minimum, select, spread
 from msdgs_serve.rasterizer.view import RasterizerOptions
 
 

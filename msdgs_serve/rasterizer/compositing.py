@@ -12,6 +12,20 @@ import numpy as np
 from msdgs_serve.rasterizer.alpha import PixelLimits, alpha_of, log2_alpha, pixel_limits, tile_offsets
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
+from msdgs_serve.rasterizer.simd.memory import load, load_columns_of, prefetch, store
+from msdgs_serve.rasterizer.simd.types import NUM_LANES, Mask, Vector
+from msdgs_serve.rasterizer.simd.vectors import (
+    bits_of,
+    filled,
+    first_of,
+    fma,
+    lowest_bit,
+    negative,
+    pair,
+    second_of,
+    select,
+    spread,
+)
 from msdgs_serve.rasterizer.splats import (
     BLUE,
     DEPTH,
@@ -38,20 +52,6 @@ from msdgs_serve.rasterizer.tile_blocks import (
 )
 from msdgs_serve.rasterizer.tile_output import clear_tile, prefetch_tile, write_cut_tile, write_tile
 from msdgs_serve.rasterizer.tiles import TileLists
-from msdgs_serve.rasterizer.vector_memory import load, load_columns_of, prefetch, store
-from msdgs_serve.rasterizer.vector_types import NUM_LANES, Mask, Vector
-from msdgs_serve.rasterizer.vectors import (
-    bits_of,
-    filled,
-    first_of,
-    fma,
-    lowest_bit,
-    negative,
-    pair,
-    second_of,
-    select,
-    spread,
-)
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_together
 

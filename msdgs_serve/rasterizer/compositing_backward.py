@@ -13,15 +13,15 @@ import numpy as np
 from msdgs_serve.rasterizer.alpha import PixelLimits, exponent_terms, log2_alpha, pixel_limits
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
 from msdgs_serve.rasterizer.compositing import TILES_PER_TURN, Frame
-from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
+from msdgs_serve.rasterizer.simd.exponential import exp2
+from msdgs_serve.rasterizer.simd.memory import load, prefetch, store
+from msdgs_serve.rasterizer.simd.squares import load_square, load_square_of_triples
+from msdgs_serve.rasterizer.simd.types import NUM_LANES
+from msdgs_serve.rasterizer.simd.vectors import bits_of, filled, fma, lowest_bit, minimum, select, spread, sums_of
 from msdgs_serve.rasterizer.splats import BLUE, DEPTH, EXTENT_X, GREEN, RECORD, RED, Splats, X, Y
 from msdgs_serve.rasterizer.tile_blocks import BLOCK_SIDE, BLOCKS, PIXELS, grid_of_a_tile, place_in_tile, touched_blocks
 from msdgs_serve.rasterizer.tiles import TileLists
-from msdgs_serve.rasterizer.vector_memory import load, prefetch, store
-from msdgs_serve.rasterizer.vector_squares import load_square, load_square_of_triples
-from msdgs_serve.rasterizer.vector_types import NUM_LANES
-from msdgs_serve.rasterizer.vectors import bits_of, filled, fma, lowest_bit, minimum, select, spread, sums_of
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_parallel, run_together, threads_to_use
 

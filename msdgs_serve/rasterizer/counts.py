@@ -5,14 +5,14 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.alpha import PixelLimits, exponent_terms, log2_alpha, pixel_limits
-from msdgs_serve.rasterizer.exponential import exp2
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.simd.exponential import exp2
+from msdgs_serve.rasterizer.simd.memory import load, store
+from msdgs_serve.rasterizer.simd.types import NUM_LANES
+from msdgs_serve.rasterizer.simd.vectors import bits_of, filled, first_of, fma, minimum, negative, pair, select, spread
 from msdgs_serve.rasterizer.splats import RECORD, Splats
 from msdgs_serve.rasterizer.tile_blocks import BLOCKS, PIXELS, grid_of_a_tile, place_in_tile, touched_blocks
 from msdgs_serve.rasterizer.tiles import TileLists
-from msdgs_serve.rasterizer.vector_memory import load, store
-from msdgs_serve.rasterizer.vector_types import NUM_LANES
-from msdgs_serve.rasterizer.vectors import bits_of, filled, first_of, fma, minimum, negative, pair, select, spread
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_parallel, split_evenly, threads_to_use
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from msdgs_serve.rasterizer.exponential import arctangent
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.vector_types import Vector
-from msdgs_serve.rasterizer.vectors import converted, filled, maximum, minimum, spread, square_root
+from msdgs_serve.rasterizer.simd.exponential import arctangent
+from msdgs_serve.rasterizer.simd.types import Vector
+from msdgs_serve.rasterizer.simd.vectors import converted, filled, maximum, minimum, spread, square_root
 from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, View
 
 

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
-from msdgs_serve.rasterizer.vector_memory import load, load_four_columns, load_triples
-from msdgs_serve.rasterizer.vector_types import Index, Vector
-from msdgs_serve.rasterizer.vectors import filled, fma
+from msdgs_serve.rasterizer.simd.memory import load, load_four_columns, load_triples
+from msdgs_serve.rasterizer.simd.types import Index, Vector
+from msdgs_serve.rasterizer.simd.vectors import filled, fma
 from msdgs_serve.scene.spherical_harmonics import SH_C0, SH_C1, SH_C2, SH_C3
 
 C20, C21, C22, C23, C24 = SH_C2

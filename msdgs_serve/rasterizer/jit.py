@@ -16,13 +16,13 @@ FAST_MATH = {"nsz", "arcp", "contract"}
 would void checks for NaN and infinity."""
 
 RASTERIZER = Path(__file__).parent
-SCENE = RASTERIZER.parent / "scene"
+FOLLOWED = (RASTERIZER, RASTERIZER / "simd", RASTERIZER.parent / "scene")
 STORED = use_writable_folder(RASTERIZER.parent)
 
 
 def kernel(function: Callable, *, inlined: bool = False) -> Any:
-    """Decorate a function that numba compiles. It may use kernels and constants of the rasterizer, of
-    `msdgs_serve.scene` and of the function's own folder. `inlined` forces inlining into its callers."""
+    """Decorate a function that numba compiles. It may use kernels and constants of the folders
+    `FOLLOWED` and of the function's own. `inlined` forces inlining into its callers."""
     compiled: Any = numba.njit(nogil=True, cache=STORED, fastmath=FAST_MATH, error_model="numpy", forceinline=inlined)(
         function
     )
@@ -42,8 +42,8 @@ def inlined_kernel(function: Callable) -> Any:
 
 @cache
 def digest_of_sources(folder: Path) -> str:
-    """Return the digest of the Python files in the folders of rasterizer and scene and in `folder`; about 1 ms."""
+    """Return the digest of the Python files in the folders `FOLLOWED` and in `folder`; about 1 ms."""
     digest = hashlib.sha256()
-    for path in sorted(file for part in {RASTERIZER, SCENE, folder} for file in part.glob("*.py")):
+    for path in sorted(file for part in {*FOLLOWED, folder} for file in part.glob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()

@@ -9,12 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
-from msdgs_serve.rasterizer.exponential import log2
 from msdgs_serve.rasterizer.geometry import covariance2d, direction, half_axis, project_points, rotate, rotation_columns
 from msdgs_serve.rasterizer.harmonics import raw_colors
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.splats import ROOT_SCALE, Splats, empty_records
-from msdgs_serve.rasterizer.vector_memory import (
+from msdgs_serve.rasterizer.simd.exponential import log2
+from msdgs_serve.rasterizer.simd.memory import (
     load_four_columns,
     load_or,
     load_triples,
@@ -23,8 +22,8 @@ from msdgs_serve.rasterizer.vector_memory import (
     store_rows,
     store_uint16,
 )
-from msdgs_serve.rasterizer.vector_types import NUM_LANES, Mask, Vector
-from msdgs_serve.rasterizer.vectors import (
+from msdgs_serve.rasterizer.simd.types import NUM_LANES, Mask, Vector
+from msdgs_serve.rasterizer.simd.vectors import (
     bits_of,
     converted,
     fma,
@@ -36,6 +35,7 @@ from msdgs_serve.rasterizer.vectors import (
     spread,
     square_root,
 )
+from msdgs_serve.rasterizer.splats import ROOT_SCALE, Splats, empty_records
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians

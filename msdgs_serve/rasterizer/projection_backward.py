@@ -17,8 +17,7 @@ from msdgs_serve.rasterizer.harmonics import (
 )
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.projection import part_count, part_range
-from msdgs_serve.rasterizer.splats import EXTENT_X, ROOT_A, ROOT_B, ROOT_C, ROOT_SCALE, Splats
-from msdgs_serve.rasterizer.vector_memory import (
+from msdgs_serve.rasterizer.simd.memory import (
     load,
     load_columns,
     load_four_columns,
@@ -27,8 +26,9 @@ from msdgs_serve.rasterizer.vector_memory import (
     store,
     store_columns,
 )
-from msdgs_serve.rasterizer.vector_types import NUM_LANES, Index, Mask, Vector
-from msdgs_serve.rasterizer.vectors import converted, filled, select, square_root
+from msdgs_serve.rasterizer.simd.types import NUM_LANES, Index, Mask, Vector
+from msdgs_serve.rasterizer.simd.vectors import converted, filled, select, square_root
+from msdgs_serve.rasterizer.splats import EXTENT_X, ROOT_A, ROOT_B, ROOT_C, ROOT_SCALE, Splats
 from msdgs_serve.rasterizer.view import RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput

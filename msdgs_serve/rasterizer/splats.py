@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_serve.rasterizer.vector_types import NUM_LANES
+from msdgs_serve.rasterizer.simd.types import NUM_LANES
 
 RECORD = NUM_LANES
 """Numbers per splat record: one vector."""

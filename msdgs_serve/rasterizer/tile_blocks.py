@@ -3,10 +3,10 @@
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.simd.memory import load
+from msdgs_serve.rasterizer.simd.types import NUM_LANES, Mask, Vector
+from msdgs_serve.rasterizer.simd.vectors import filled, fma, maximum, negative, spread
 from msdgs_serve.rasterizer.splats import EXTENT_X, LOG2_OPACITY, ROOT_A, ROOT_B, ROOT_C, X, Y
-from msdgs_serve.rasterizer.vector_memory import load
-from msdgs_serve.rasterizer.vector_types import NUM_LANES, Mask, Vector
-from msdgs_serve.rasterizer.vectors import filled, fma, maximum, negative, spread
 from msdgs_serve.rasterizer.view import TILE
 
 BLOCKS = TILE * TILE // NUM_LANES

@@ -3,11 +3,11 @@
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
+from msdgs_serve.rasterizer.simd.memory import load, prefetch, store
+from msdgs_serve.rasterizer.simd.squares import store_square, store_square_of_triples
+from msdgs_serve.rasterizer.simd.types import NUM_LANES, Vector
+from msdgs_serve.rasterizer.simd.vectors import negative, select, spread
 from msdgs_serve.rasterizer.tile_blocks import BLOCK_SIDE, BLOCKS, PIXELS, place_in_tile
-from msdgs_serve.rasterizer.vector_memory import load, prefetch, store
-from msdgs_serve.rasterizer.vector_squares import store_square, store_square_of_triples
-from msdgs_serve.rasterizer.vector_types import NUM_LANES, Vector
-from msdgs_serve.rasterizer.vectors import negative, select, spread
 from msdgs_serve.rasterizer.view import TILE
 
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.simd.memory import prefetch
 from msdgs_serve.rasterizer.splats import Splats
-from msdgs_serve.rasterizer.vector_memory import prefetch
 from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.threads import run_parallel, run_serially, split_evenly, threads_to_use
 

@@ -17,7 +17,7 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.quaternions import rotate
-from msdgs_train.rendering.rasterize import RasterizationInfo
+from msdgs_train.rendering.info import RasterizationInfo
 
 SPLIT_SHRINK = 1.6
 """Scales of the two halves of a split Gaussian are divided by this factor."""

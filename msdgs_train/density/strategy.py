@@ -8,7 +8,7 @@ from torch import Tensor
 from msdgs_train.density.config import DensityConfig
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.surgery import RowSurgery
-from msdgs_train.rendering.rasterize import RasterizationInfo
+from msdgs_train.rendering.info import RasterizationInfo
 
 
 @dataclass

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
-from msdgs_train.supports.base import Attribute
+from msdgs_train.gaussians.attribute import Attribute
 
 INITIAL_OPACITY = 0.1
 NEIGHBORS = 3

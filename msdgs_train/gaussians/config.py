@@ -7,6 +7,7 @@ from typing import Any, get_args
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
+from msdgs_train.gaussians.attribute import Attribute
 from msdgs_train.gaussians.modulation import EMBEDDINGS, ModulationTarget, embeddings_attribute
 from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.layers.base import Heads, LayerConfig
@@ -14,7 +15,7 @@ from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.parts import from_plain, to_plain
 from msdgs_train.layers.registry import LAYERS
-from msdgs_train.supports.base import Attribute, SupportConfig
+from msdgs_train.supports.base import SupportConfig
 from msdgs_train.supports.gaussians import GaussiansConfig
 from msdgs_train.supports.registry import SUPPORTS
 

@@ -6,8 +6,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor, nn
 
+from msdgs_train.gaussians.attribute import Attribute
 from msdgs_train.layers.parameters import LearningRate
-from msdgs_train.supports.base import Attribute
 
 ModulationTarget = Literal["means", "scales", "quats"]
 

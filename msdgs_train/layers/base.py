@@ -1,4 +1,5 @@
-"""Settings of a deformation layer: one step of a chain that moves Gaussians or control nodes (paper, equation 7).
+"""The interface of a deformation layer, one step of a chain that moves Gaussians or control nodes (paper, equation 7):
+its outputs, its module and its settings.
 
 A new kind is one file: a frozen dataclass that derives from `LayerConfig`, a module that derives from
 `DeformationLayer`, and a line that registers the first in `layers.registry`.
@@ -6,12 +7,12 @@ A new kind is one file: a frozen dataclass that derives from `LayerConfig`, a mo
 
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
+
+from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import InvalidInput
-
-if TYPE_CHECKING:
-    from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.parameters import ParamGroup
 
 HEAD_COLUMNS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
 """Columns of a layer's deltas, in the order of `Heads.sizes`; the logit of the step weight, if any, is the last."""
@@ -47,6 +48,52 @@ class SceneBounds(NamedTuple):
     time_range: tuple[float, float] = (0.0, 1.0)
 
 
+class LayerStep(NamedTuple):
+    """Outputs of one layer for N points at one time; the deltas are not yet multiplied by the weight."""
+
+    delta_means: Tensor  # [N, 3] scene units
+    delta_scales: Tensor  # [N, 3] as the model's `scale_space` says; on nodes [N, 3] or [N, 6] of a stretch tensor
+    delta_quats: Tensor  # [N, 4] wxyz
+    weight: Tensor  # [N, 1] in (0, 1); 1 without the head
+    delta_opacities: Tensor | None = None  # [N] of logits
+    delta_sh: Tensor | None = None  # [N, (degree + 1)², 3]
+
+    @classmethod
+    def of_columns(cls, columns: Tensor, heads: Heads) -> "LayerStep":
+        """Split the concatenated outputs of all heads, [N, sum of `heads.sizes`]."""
+        means, scales, quats, opacity, sh, logit = columns.split(heads.sizes, dim=1)
+        weight = logit.sigmoid() if heads.weight else columns.new_ones(len(columns), 1)
+        opacities = opacity[:, 0] if heads.opacity else None
+        return cls(means, scales, quats, weight, opacities, sh.unflatten(1, (heads.sh, 3)) if heads.sh else None)
+
+
+class DeformationLayer(nn.Module):
+    """D_k of equation 7: a function of positions and time, of Gaussians or of control nodes."""
+
+    kind: ClassVar[str]
+
+    def forward(self, means: Tensor, t: Tensor) -> LayerStep:
+        """Deltas of points at `means`, [N, 3], as moved by the layers before; `t` is a scalar tensor of the same dtype
+        and device."""
+        raise NotImplementedError
+
+    def parameter_groups(self) -> list[ParamGroup]:
+        """All trainable parameters, each in one group, with their learning rates."""
+        raise NotImplementedError
+
+    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
+        """Weighted terms of the loss at time `t`, by name."""
+        return {}
+
+    def on_window(self, before: float, after: float) -> None:
+        """Extrapolate when the time window widens; half widths, as fractions of the time range."""
+
+    def operations(self) -> int:
+        """Floating-point operations per point; by default a product and a sum per weight of a Linear."""
+        linears = [module for module in self.modules() if isinstance(module, nn.Linear)]
+        return 2 * sum(linear.weight.numel() for linear in linears)
+
+
 @dataclass(frozen=True)
 class LayerConfig:
     """Sizes and learning rates of one layer; each layer of a model has its own."""
@@ -54,7 +101,7 @@ class LayerConfig:
     kind: ClassVar[str]
     """The name of this kind of layer in configurations and files."""
 
-    def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "DeformationLayer":
+    def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> DeformationLayer:
         """A new layer, with zero deltas; `num_points` is the number of control nodes, None if it moves Gaussians."""
         raise NotImplementedError
 

@@ -8,8 +8,15 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.layers.base import PAPER_HEADS, Heads, LayerConfig, SceneBounds, check_size
-from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.layers.base import (
+    PAPER_HEADS,
+    DeformationLayer,
+    Heads,
+    LayerConfig,
+    LayerStep,
+    SceneBounds,
+    check_size,
+)
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 
 HIDDEN_BIAS, XYZ_GAIN, TIME_GAIN = -1.0, 2.0, 3.0

@@ -12,8 +12,15 @@ from torch.autograd.function import once_differentiable
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.threads import run_parallel, split_evenly
 from msdgs_train.layers.arrays import to_array
-from msdgs_train.layers.base import PAPER_HEADS, Heads, LayerConfig, SceneBounds, check_size
-from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.layers.base import (
+    PAPER_HEADS,
+    DeformationLayer,
+    Heads,
+    LayerConfig,
+    LayerStep,
+    SceneBounds,
+    check_size,
+)
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.plane_kernels import plane_features, plane_gradients
 

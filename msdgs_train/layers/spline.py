@@ -12,8 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.layers.base import Heads, LayerConfig, SceneBounds, check_size
-from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.layers.base import DeformationLayer, Heads, LayerConfig, LayerStep, SceneBounds, check_size
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.quaternions import multiply, unit
 

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_train.rendering.rasterize import RasterizationInfo
+from msdgs_train.rendering.info import RasterizationInfo
 
 
 def rasterize_cuda(

@@ -17,15 +17,7 @@ from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.layers.arrays import to_array
-
-
-class RasterizationInfo:
-    """Radii and gradients of one rendering, for density control."""
-
-    radii: Tensor
-    """[N] larger half-extent of the footprint in pixels; 0 for Gaussians that are not drawn."""
-    means2d_grads: Tensor | None = None
-    """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
+from msdgs_train.rendering.info import RasterizationInfo
 
 
 def require_device(device: str) -> None:

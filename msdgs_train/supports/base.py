@@ -1,26 +1,14 @@
 """The interface of a support: which points a chain of layers moves, and how the Gaussians follow these points."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import torch
 from torch import Tensor, nn
 
+from msdgs_train.gaussians.attribute import Attribute
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.layers.parameters import LearningRate
-
-if TYPE_CHECKING:
-    from msdgs_train.gaussians.canonical import CanonicalGaussians
-    from msdgs_train.gaussians.surgery import RowSurgery
-
-
-class Attribute(NamedTuple):
-    """Numbers stored per Gaussian besides mean, scales, rotation, opacity and color."""
-
-    columns: int
-    init: Callable[[int, int, torch.Generator], Tensor]  # of rows, columns and a generator; integers aren't trained
-    lr: LearningRate
 
 
 class CanonicalPoints(NamedTuple):
@@ -81,7 +69,7 @@ class Support(nn.Module):
         """[M, 3] canonical positions of the points that the chain moves, given canonical means, [N, 3]."""
         raise NotImplementedError
 
-    def on_deform_start(self, gaussians: "CanonicalGaussians", surgery: "RowSurgery") -> None:
+    def on_deform_start(self, gaussians: CanonicalGaussians, surgery: RowSurgery) -> None:
         """Called before the first step with deformation."""
 
     def regularizers(self, motions: Any) -> dict[str, Tensor]:

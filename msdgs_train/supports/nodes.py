@@ -6,25 +6,24 @@ the number of Gaussians.
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_train.gaussians.attribute import Attribute
+from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import check_size
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.quaternions import rotation_matrices, stretch_matrices, unit
-from msdgs_train.supports.base import Attribute, CanonicalPoints, Support, SupportConfig
+from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
 from msdgs_train.supports.skinning import skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MOTION
-
-if TYPE_CHECKING:
-    from msdgs_train.gaussians.canonical import CanonicalGaussians
-    from msdgs_train.gaussians.surgery import RowSurgery
 
 NODE_MIN_OPACITY = 0.3
 """Gaussians of a larger opacity are candidates for nodes."""
@@ -115,7 +114,7 @@ class NodesSupport(Support):
         return torch.cat([matrices.flatten(1), offsets, rots], dim=1)
 
     @torch.no_grad()
-    def on_deform_start(self, gaussians: "CanonicalGaussians", surgery: "RowSurgery") -> None:
+    def on_deform_start(self, gaussians: CanonicalGaussians, surgery: RowSurgery) -> None:
         """Place the nodes among opaque Gaussians and initialize the skinning weights."""
         logits, ids = self.initialize_nodes(gaussians.means.detach(), gaussians.raw_opacities.detach().sigmoid())
         surgery.replace_values("skinning_logits", logits)

@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 
-from msdgs_serve.rasterizer.exponential import log2
 from msdgs_serve.rasterizer.geometry import rotation_columns
 from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.projection_backward import quaternion_gradient
-from msdgs_serve.rasterizer.vector_memory import (
+from msdgs_serve.rasterizer.simd.exponential import log2
+from msdgs_serve.rasterizer.simd.memory import (
     load,
     load_columns,
     load_four_columns,
@@ -25,8 +25,8 @@ from msdgs_serve.rasterizer.vector_memory import (
     store_columns,
     store_rows,
 )
-from msdgs_serve.rasterizer.vector_types import NUM_LANES, Vector
-from msdgs_serve.rasterizer.vectors import filled, fma, maximum, select, spread, square_root, sums_of
+from msdgs_serve.rasterizer.simd.types import NUM_LANES, Vector
+from msdgs_serve.rasterizer.simd.vectors import filled, fma, maximum, select, spread, square_root, sums_of
 from msdgs_serve.scene.quaternion import MIN_NORM
 
 MAX_NEAREST = 8

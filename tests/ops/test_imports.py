@@ -1,8 +1,12 @@
-"""Which package may import which: checked in the sources by import-linter, and in fresh interpreters."""
+"""Which package may import which: checked in the sources by import-linter, and in fresh interpreters; no circles."""
 
+import ast
 import json
 import subprocess
 import sys
+from collections.abc import Iterator, Set
+from graphlib import CycleError, TopologicalSorter
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
@@ -33,6 +37,55 @@ def test_import_contracts_hold() -> None:
     command = [Path(sys.executable).with_name("lint-imports"), "--no-cache"]
     finished = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600, check=False)
     assert finished.returncode == 0, finished.stdout + finished.stderr
+
+
+def import_graph(package: Path) -> dict[str, set[str]]:
+    """Return the modules of a package, and which of them each imports, in functions and under TYPE_CHECKING too."""
+    paths = {".".join(path.relative_to(package.parent).with_suffix("").parts): path for path in package.rglob("*.py")}
+    modules = {name.removesuffix(".__init__"): path for name, path in paths.items()}
+    return {name: set(_imports(name, path, modules.keys())) - {name} for name, path in modules.items()}
+
+
+def _imports(name: str, path: Path, modules: Set[str]) -> Iterator[str]:
+    parent = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            found = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            origin = resolve_name("." * node.level + (node.module or ""), parent)
+            inner = [f"{origin}.{alias.name}" for alias in node.names]
+            found = [module if module in modules else origin for module in inner]
+        else:
+            continue
+        yield from (module for module in found if module in modules)
+
+
+@pytest.mark.parametrize("package", ["msdgs_serve", "msdgs_train", "export"])
+def test_no_imports_go_in_circles(package: str) -> None:
+    graph = import_graph(ROOT / package)
+    assert sum(map(len, graph.values())) > len(graph)
+    TopologicalSorter(graph).prepare()
+
+
+@pytest.mark.parametrize(
+    "back",
+    [
+        "import package.a",
+        "from package import a",
+        "from . import a",
+        "from .a import thing",
+        "def f():\n    from package.a import thing",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from package.a import thing",
+    ],
+)
+def test_a_circle_is_found(back: str, tmp_path: Path) -> None:
+    files = {"__init__": "", "a": "from package.b import thing", "b": "from package.c import thing", "c": back}
+    for name, text in files.items():
+        path = tmp_path / "package" / f"{name}.py"
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text)
+    with pytest.raises(CycleError):
+        TopologicalSorter(import_graph(tmp_path / "package")).prepare()
 
 
 @pytest.mark.parametrize(

@@ -31,8 +31,8 @@ BUILDS_CODE = ("def .*builder: Any", "@lower_builtin", "@type_callable", "@regis
 def kernel_files() -> list[Path]:
     """The rasterizer's files with kernels, and those with the operations that kernels are written in."""
     folder = ROOT / "msdgs_serve" / "rasterizer"
-    return [path for path in sorted(folder.glob("*.py")) if "@kernel" in path.read_text()] + [
-        folder / name for name in ("atomic.py", "vectors.py", "vector_memory.py", "vector_squares.py")
+    return [path for path in sorted(folder.rglob("*.py")) if "@kernel" in path.read_text()] + [
+        folder / "simd" / name for name in ("vectors.py", "memory.py", "squares.py")
     ]
 
 

@@ -149,16 +149,18 @@ CALLER_OF_OTHERS = """
 import numpy as np
 from msdgs_serve.rasterizer.harmonics import harmonics_above_0
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.simd.types import NUM_LANES
 from package.constants import FACTOR
 
 @kernel
 def double(x):
-    return FACTOR * harmonics_above_0(0.0, -1.0, 0.0)[0] * x
+    return FACTOR * NUM_LANES * harmonics_above_0(0.0, -1.0, 0.0)[0] * x
 """
 
 EDITS = {  # sources of a kernel in `package` besides its own file
     "kernel": ("msdgs_serve/rasterizer/harmonics.py", "        -SH_C1 * y,", "        -2 * SH_C1 * y,"),
     "constant": ("msdgs_serve/scene/spherical_harmonics.py", "SH_C1 = 0.48", "SH_C1 = 3 * 0.48"),
+    "vectors": ("msdgs_serve/rasterizer/simd/types.py", "NUM_LANES = 16", "NUM_LANES = 112"),
     "neighbour": ("package/constants.py", "1.0", "5.0"),
 }
 
@@ -173,7 +175,7 @@ def test_machine_code_follows_every_source(tmp_path: Path):
     expected, compiled = call(tmp_path, tmp_path / "cache")
     assert compiled
     assert call(tmp_path, tmp_path / "cache") == (expected, False)
-    for (name, old, new), factor in zip(EDITS.values(), (2, 3, 5), strict=True):
+    for (name, old, new), factor in zip(EDITS.values(), (2, 3, 7, 5), strict=True):
         file = tmp_path / name
         source = file.read_text()
         assert old in source
@@ -191,10 +193,10 @@ def kernel_files() -> list[Path]:
 
 @pytest.mark.parametrize("file", kernel_files(), ids=lambda file: file.stem)
 def test_kernels_use_only_what_their_stamp_follows(file: Path):
-    """Kernels use modules of the rasterizer, the scene and their own folder only."""
+    """Kernels use modules of the rasterizer, its vectors, the scene and their own folder only."""
     tree = ast.parse(file.read_text())
     own = ".".join(file.relative_to(ROOT).parent.parts)
-    followed = ("msdgs_serve.rasterizer", "msdgs_serve.scene", own)
+    followed = ("msdgs_serve.rasterizer", "msdgs_serve.rasterizer.simd", "msdgs_serve.scene", own)
     origins = {
         alias.asname or alias.name: node.module or ""
         for node in ast.walk(tree)

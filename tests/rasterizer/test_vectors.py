@@ -6,11 +6,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from msdgs_serve.rasterizer import vector_memory as memory
-from msdgs_serve.rasterizer import vector_squares, vectors
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
-from msdgs_serve.rasterizer.exponential import exp2, exp2_polynomial, log2
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.simd import memory, vectors
+from msdgs_serve.rasterizer.simd.exponential import exp2, exp2_polynomial, log2
+from msdgs_serve.rasterizer.simd.squares import (
+    load_square,
+    load_square_of_triples,
+    store_square,
+    store_square_of_triples,
+)
 from tests.support.tolerances import assert_close
 
 DTYPES = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["float32", "float64"])
@@ -79,14 +84,14 @@ def rows_and_columns(
 ) -> None:
     block = memory.load_columns(matrix, 3)
     memory.store_columns(out, 5, 3, block)
-    vector_squares.store_square(squares, 2, 7, block[0])
-    vector_squares.store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
+    store_square(squares, 2, 7, block[0])
+    store_square_of_triples(triples, 1, 13, block[0], block[1], block[2])
     memory.store_columns(picked, 0, 0, memory.load_columns_of(picked, rows, 1))
     memory.store_rows(loaded, 1, memory.load_four_columns(matrix, 2, 7))
     memory.store_rows(loaded, 17, memory.load_triples(points, 2))
     memory.store_rows(loaded, 33, memory.load_triples(points, 1))
-    memory.store_rows(loaded, 50, (vector_squares.load_square(squares, 2, 7),))
-    memory.store_rows(loaded, 66, vector_squares.load_square_of_triples(triples, 1, 13))
+    memory.store_rows(loaded, 50, (load_square(squares, 2, 7),))
+    memory.store_rows(loaded, 66, load_square_of_triples(triples, 1, 13))
     memory.prefetch(squares, 3)
 
 

@@ -12,8 +12,15 @@ from torch import Tensor, nn
 from msdgs_train.datasets import Frame
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.gaussians.config import ModelConfig
-from msdgs_train.layers.base import HEAD_COLUMNS, Heads, LayerConfig, SceneBounds, check_size
-from msdgs_train.layers.deformation import DeformationLayer, LayerStep
+from msdgs_train.layers.base import (
+    HEAD_COLUMNS,
+    DeformationLayer,
+    Heads,
+    LayerConfig,
+    LayerStep,
+    SceneBounds,
+    check_size,
+)
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.registry import register_layer
 from msdgs_train.systems.base import Target, ViewLoss

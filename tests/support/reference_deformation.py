@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
 from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.layers.deformation import DeformationLayer
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.mlp import MLPLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 from msdgs_train.layers.spline import SplineLayer

@@ -11,7 +11,7 @@ from msdgs_train.density.gradient import MIN_PATIENCE, SPLIT_SHRINK, GradientStr
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
-from msdgs_train.rendering.rasterize import RasterizationInfo
+from msdgs_train.rendering.info import RasterizationInfo
 from tests.support.training_scene import moment_rows, small_config, with_moments
 
 EXTENT = 4.0

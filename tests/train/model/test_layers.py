@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from msdgs_train.gaussians.modulation import Modulation
-from msdgs_train.layers.base import Heads
+from msdgs_train.layers.base import DeformationLayer, Heads
 from msdgs_train.layers.chain import MultiStepDeformation
-from msdgs_train.layers.deformation import DeformationLayer
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer, frequency_matrix, positional_encoding
 from msdgs_train.layers.plane import PlaneLayer
 from msdgs_train.layers.spline import SplineConfig, SplineLayer

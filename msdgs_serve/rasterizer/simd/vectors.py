@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import lower_builtin
 
-from msdgs_serve.rasterizer.vector_types import (
+from msdgs_serve.rasterizer.simd.types import (
     FREEDOMS,
     MASK,
     NUM_LANES,

@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import lower_builtin
 
-from msdgs_serve.rasterizer.vector_types import (
+from msdgs_serve.rasterizer.simd.types import (
     NUM_LANES,
     Index,
     Vector,
@@ -25,7 +25,7 @@ from msdgs_serve.rasterizer.vector_types import (
     shuffled,
     typed,
 )
-from msdgs_serve.rasterizer.vectors import as_rows, padded
+from msdgs_serve.rasterizer.simd.vectors import as_rows, padded
 
 
 def _columns_of(array: Any, count: int) -> types.Type | None:

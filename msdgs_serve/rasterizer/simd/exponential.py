@@ -6,8 +6,8 @@ from functools import cache
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
-from msdgs_serve.rasterizer.vector_types import Vector
-from msdgs_serve.rasterizer.vectors import exponent_of, filled, mantissa_of, rounder, select, times_power_of_two
+from msdgs_serve.rasterizer.simd.types import Vector
+from msdgs_serve.rasterizer.simd.vectors import exponent_of, filled, mantissa_of, rounder, select, times_power_of_two
 
 ATANH_SERIES = tuple(2 / math.log(2) / n for n in range(21, 0, -2))
 """Coefficients of 2 atanh(s) / (s ln 2), highest power of s² first."""

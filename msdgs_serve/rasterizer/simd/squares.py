@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import lower_builtin
 
-from msdgs_serve.rasterizer.vector_types import (
+from msdgs_serve.rasterizer.simd.types import (
     NUM_LANES,
     Index,
     Vector,
