@@ -46,8 +46,7 @@ NOT_MODIFIED: Responses = {304: {"description": "The client has this version"}}
 FILE_RESPONSE = _file(
     "The file",
     ["application/octet-stream"],
-    ETag="SHA-256 of the file, weak if it is compressed",
-    Content_Encoding="`zstd`, if the client takes it",
+    ETag="SHA-256 of the file",
     Content_Disposition="with the file's name",
 )
 BATCH_RESPONSE: Responses = {

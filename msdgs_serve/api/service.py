@@ -32,7 +32,7 @@ JOIN_SECONDS = 2.0
 """Time that shutdown waits for the thread that refreshes scenes: if it is killed, libraries print errors."""
 
 READ_AT_ONCE = 2
-"""Threads that read and compress scene files for downloads: more would delay renders."""
+"""Threads that read scene files for downloads: more would delay renders."""
 
 logger = logging.getLogger("msdgs_serve")
 

@@ -10,7 +10,7 @@ class LossConfig(Checked):
     """Weights of the loss between a rendering and its image."""
 
     ssim_lambda: float = 0.2
-    """Weight of 1 − SSIM; the weight of L1 is 1 minus this (λ in equation 13)."""
+    """Weight of 1 − SSIM, by gsplat's name: 1 − λ of equation 13, whose λ is the weight of L1."""
     mse_fraction: float = 0.0
     """Fraction of the loss that is replaced by MSE, which emphasizes large errors, such as those of motion."""
     alpha_weight: float = 0.0

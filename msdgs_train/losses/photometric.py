@@ -24,7 +24,7 @@ def photometric_loss(
     Args:
         rgb: [H, W, 3] the rendering, float32 or float64; the loss is differentiable in it.
         target: [H, W, 3] the image, same dtype, values in [0, 1].
-        l1_weight: λ; the field uses 0.8.
+        l1_weight: λ, 1 − `LossConfig.ssim_lambda`; the field uses 0.8.
         mse_fraction: fraction of MSE; 0 is equation 13, 1 is `MSE_SCALE` times the mean squared error.
         mask: [H, W] bool, true where pixels count; None: all do. The loss is the mean over those, and the rendering's
             others are replaced by the image's, as `filled` does.

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import sys
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,7 +15,7 @@ from export.importers.errors import ImportFailed
 from export.importers.splats import formats
 from export.importers.splats.formats import read_splats
 from export.importers.splats.unpack import MIN_LIMIT
-from tests.support.splat_files import FORMATS, inria_columns, ply_bytes, some_gaussians
+from tests.support.splat_files import FORMATS, inria_columns, ply_bytes, some_gaussians, write_splats
 
 G = some_gaussians(20)
 PLY = ply_bytes(inria_columns(G))
@@ -149,3 +150,11 @@ def test_faults_of_a_zip_are_told_in_words_of_ours(
     (tmp_path / "a.zip").write_bytes(contents)
     with pytest.raises(ImportFailed, match=problem):
         read_splats(tmp_path / "a.zip")
+
+
+@pytest.mark.usefixtures("here")
+def test_zstandard_is_needed_by_spz_4_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    assert len(read_splats(write_splats(tmp_path, "spz 3, bare", G)).gaussians) == len(G)
+    with pytest.raises(ImportFailed, match=r"SPZ version 4, which needs zstandard: pip install '\.\[export\]'"):
+        read_splats(write_splats(tmp_path, "spz 4", G))

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.slow
 
 HEAVY = {"numpy", "numba", "onnxruntime", "OpenImageIO", "fastapi", "pydantic", "torch"}
 HTTP = {"fastapi", "starlette", "uvicorn", "pydantic", "pydantic_settings"}
-NOT_FOR_SERVING = {"torch", "onnx", "msdgs_train", "export", "matplotlib", "tyro", "rich"}
+NOT_FOR_SERVING = {"torch", "onnx", "msdgs_train", "export", "matplotlib", "tyro", "rich", "zstandard"}
 
 IMPORT_ALL = """
 import importlib, pkgutil, msdgs_serve

@@ -66,7 +66,7 @@ def clean_environment() -> dict[str, str]:
 
 def test_the_package_is_installed_and_nothing_of_training(environment: Path, described: dict) -> None:
     assert Path(described["where"]).is_relative_to(environment)
-    assert not {"torch", "onnx", "tyro", "rich", "matplotlib", "pytest"} & set(described["distributions"])
+    assert not {"torch", "onnx", "tyro", "rich", "matplotlib", "pytest", "zstandard"} & set(described["distributions"])
 
 
 def test_the_wheel_holds_the_two_packages_and_their_data(described: dict) -> None:

@@ -1,4 +1,4 @@
-"""Downloads of scene files: the given bytes, compressed or not, whole or visibly cut off."""
+"""Downloads of scene files: the given bytes, whole or visibly cut off."""
 
 import contextlib
 import hashlib
@@ -9,9 +9,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-import zstandard
 
-from msdgs_serve.api.downloads import takes_zstd
 from tests.support.scene_files import write_scene
 from tests.support.service import check_problem, connect, eventually, own_connection, rest_of, serving
 
@@ -25,10 +23,6 @@ def client(folder: Path) -> Iterator[httpx.Client]:
         yield client
 
 
-def get(client: httpx.Client, encoding: str = "identity", **headers: str) -> httpx.Response:
-    return client.get(PATH, headers={"Accept-Encoding": encoding, **headers})
-
-
 @pytest.mark.parametrize("uploaded", [True, False])
 def test_the_given_bytes_are_returned(client: httpx.Client, folder: Path, file: bytes, uploaded: bool):
     file += b"\x32\x04mine"  # its doc_string, which the service's own graphs don't have
@@ -37,32 +31,18 @@ def test_the_given_bytes_are_returned(client: httpx.Client, folder: Path, file: 
     else:
         (folder / f"{NAME}.onnx").write_bytes(file)
     digest = hashlib.sha256(file).hexdigest()
-    plain, packed = get(client), get(client, "gzip, zstd;q=0.5")
-    assert plain.content == packed.content == file
-    assert plain.headers["Content-Length"] == str(len(file))
-    assert "Content-Encoding" not in plain.headers
-    assert packed.headers["Content-Encoding"] == "zstd"
-    assert (plain.headers["ETag"], packed.headers["ETag"]) == (f'"{digest}"', f'W/"{digest}"')
-    for response in (plain, packed):
-        assert response.headers["Content-Type"] == "application/octet-stream"
-        assert response.headers["Vary"] == "Accept-Encoding"
-        expected = "attachment; filename*=UTF-8''a%20%22b%22%3B%2050%25%20%E2%80%93%20it%27s.onnx"
-        assert response.headers["Content-Disposition"] == expected
-        unchanged = get(client, **{"If-None-Match": f'"other", {response.headers["ETag"]}'})
+    response = client.get(PATH)
+    assert response.content == file
+    assert response.headers["Content-Length"] == str(len(file))
+    assert response.headers["ETag"] == f'"{digest}"'
+    assert response.headers["Content-Type"] == "application/octet-stream"
+    expected = "attachment; filename*=UTF-8''a%20%22b%22%3B%2050%25%20%E2%80%93%20it%27s.onnx"
+    assert response.headers["Content-Disposition"] == expected
+    for known in (f'"other", "{digest}"', f'W/"{digest}"'):
+        unchanged = client.get(PATH, headers={"If-None-Match": known})
         assert (unchanged.status_code, unchanged.content) == (304, b"")
-        assert unchanged.headers["Vary"] == "Accept-Encoding"
-    assert get(client, **{"If-None-Match": '"other"'}).content == file
+    assert client.get(PATH, headers={"If-None-Match": '"other"'}).content == file
     assert 'route="/scenes/{name}/file",status="304"' in client.get("/metrics").text
-
-
-@pytest.mark.parametrize(
-    ("accepted", "takes"),
-    [(None, False), ("", False), ("zstd", True), ("gzip, ZSTD ; q=0.1", True), ("zstd;q=0", False), ("*", True),
-     ("*;q=0", False), ("*, zstd;q=0.0", False), ("zstd;q=0.5, identity", False), ("gzip", False), ("zstd;q=x", False),
-     ("zstd;q=0.5, identity;q=0.5", True), ("zstdx", False), (";q=1,,=", False)],
-)  # fmt: skip
-def test_weights_of_encodings_are_respected(accepted: str | None, takes: bool):
-    assert takes_zstd(accepted) == takes
 
 
 def large_scene(path: Path) -> bytes:
@@ -76,20 +56,18 @@ def large_scene(path: Path) -> bytes:
 
 
 @contextlib.contextmanager
-def begun(client: httpx.Client, encoding: str) -> Iterator[tuple[socket.socket, bytes]]:
+def begun(client: httpx.Client) -> Iterator[tuple[socket.socket, bytes]]:
     """A connection on which a download has begun, and its first bytes."""
-    request = f"GET /scenes/walk/file HTTP/1.1\r\nHost: x\r\nAccept-Encoding: {encoding}\r\nConnection: close\r\n\r\n"
-    with connect(client, request.encode()) as connection:
+    with connect(client, b"GET /scenes/walk/file HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n") as connection:
         yield connection, connection.recv(65536)
 
 
 @own_connection
 @pytest.mark.parametrize("change", ["replaced", "deleted", "overwritten"])
-@pytest.mark.parametrize("encoding", ["identity", "zstd"])
-def test_a_download_is_whole_or_cut_off(client: httpx.Client, folder: Path, tmp_path: Path, change: str, encoding: str):
+def test_a_download_is_whole_or_cut_off(client: httpx.Client, folder: Path, tmp_path: Path, change: str):
     path = folder / "walk.onnx"
     old, new = large_scene(path), write_scene(tmp_path / "new.onnx", static_color=(0, 0, 1)).read_bytes()
-    with begun(client, encoding) as (connection, first):
+    with begun(client) as (connection, first):
         if change == "deleted":
             assert client.delete("/scenes/walk").status_code == 204
         elif change == "replaced":
@@ -103,15 +81,8 @@ def test_a_download_is_whole_or_cut_off(client: httpx.Client, folder: Path, tmp_
     assert head.startswith(b"HTTP/1.1 200 ")
     if change == "overwritten":
         assert len(body) < len(old)
-        assert not body.endswith(b"\r\n0\r\n\r\n")
-    elif encoding == "identity":
-        assert body == old
     else:
-        chunks = bytearray()
-        while (size := int((line := body.partition(b"\r\n"))[0], 16)) > 0:
-            chunks += line[2][:size]
-            body = line[2][size + 2 :]
-        assert zstandard.ZstdDecompressor().stream_reader(bytes(chunks)).read() == old
+        assert body == old
     if change == "deleted":
         check_problem(client.get("/scenes/walk/file"), 404)
     elif change == "replaced":
@@ -121,10 +92,10 @@ def test_a_download_is_whole_or_cut_off(client: httpx.Client, folder: Path, tmp_
 def test_a_broken_file_is_not_returned_while_its_old_version_is_served(client: httpx.Client, folder: Path, file: bytes):
     path = folder / f"{NAME}.onnx"
     path.write_bytes(file)
-    assert get(client).content == file
+    assert client.get(PATH).content == file
     path.write_bytes(b"no scene")
     statuses = []
-    eventually(lambda: statuses.append(get(client)) or "invalid" in statuses[-1].text)
+    eventually(lambda: statuses.append(client.get(PATH)) or "invalid" in statuses[-1].text)
     assert client.get(PATH.removesuffix("/file")).status_code == 200
     for response in statuses:
         check_problem(response, 503)

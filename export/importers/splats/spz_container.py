@@ -9,8 +9,6 @@ import zlib
 from pathlib import Path
 from typing import NamedTuple
 
-import zstandard
-
 from export.importers.errors import ImportFailed, cut_off
 from msdgs_serve.scene.fields import FieldTable
 
@@ -194,6 +192,10 @@ def _of_streams(file: Path, header: Header, contents: bytes) -> Container:
 def _zstd(file: Path, number: int, packed: bytes, size: int) -> bytes:
     if not size:
         return b""
+    try:
+        import zstandard
+    except ModuleNotFoundError:
+        raise ImportFailed(file, "is SPZ version 4, which needs zstandard: pip install '.[export]'") from None
     try:
         stated = zstandard.frame_content_size(packed)
         if stated not in (-1, size):

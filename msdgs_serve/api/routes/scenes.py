@@ -13,10 +13,10 @@ from urllib.parse import quote
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, Header, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.requests import ClientDisconnect
 
-from msdgs_serve.api.downloads import SceneFileResponse, file_headers, takes_zstd
+from msdgs_serve.api.downloads import SceneFileResponse, file_headers
 from msdgs_serve.api.errors import ClientGone, RequestRejected
 from msdgs_serve.api.frames import IfNoneMatch, is_unchanged
 from msdgs_serve.api.keys import CLIENT
@@ -79,13 +79,8 @@ def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
     response_class=Response,
     responses={**FILE_RESPONSE, **NOT_MODIFIED, **problems(404, 422, 503)},
 )
-def scene_file(
-    name: SceneName,
-    service: SharedService,
-    accept_encoding: Annotated[str | None, Header(max_length=1000, examples=["zstd"])] = None,
-    if_none_match: IfNoneMatch = None,
-) -> Response:
-    """The bytes that were uploaded or lie in the folder, compressed if `Accept-Encoding` takes `zstd`.
+def scene_file(name: SceneName, service: SharedService, if_none_match: IfNoneMatch = None) -> Response:
+    """The bytes that were uploaded or lie in the folder.
 
     Loads the scene if necessary. A download is finished if the scene is replaced or deleted meanwhile. 503 with
     `Retry-After` until a file that has changed is reloaded, and without it if the new one is broken.
@@ -94,12 +89,11 @@ def scene_file(
     if contents is None:
         detail = "The scene's file has changed and is being reloaded."
         raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "reloading", detail, retry_after=1)
-    compressed = takes_zstd(accept_encoding)
-    headers = file_headers(contents, compressed=compressed)
-    if is_unchanged(if_none_match, f'"{contents.sha256}"'):
+    headers = file_headers(contents)
+    if is_unchanged(if_none_match, headers["ETag"]):
         contents.file.close()
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    return SceneFileResponse(contents, headers, service.reading, compressed=compressed)
+    return SceneFileResponse(contents, headers, service.reading)
 
 
 @router.post(
