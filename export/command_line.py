@@ -5,7 +5,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
-from msdgs_serve.process import EXIT_INTERRUPTED
+from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.writing import in_words
 
@@ -23,7 +23,7 @@ __all__ = ["Console", "run", "tyro"]
 
 
 def run(command: Callable[[Console], int | None], on_interrupt: str) -> int:
-    """Run a command with a console for messages; returns its exit status: 1 after an error, 130 after Ctrl-C."""
+    """Run a command with a console for messages; returns its exit status: 2 after an error, 130 after Ctrl-C."""
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     try:
         return command(console) or 0
@@ -32,4 +32,4 @@ def run(command: Callable[[Console], int | None], on_interrupt: str) -> int:
         return EXIT_INTERRUPTED
     except (MsdgsError, OSError) as error:
         console.print(f"error: {in_words(error)}", style="red", markup=False)
-        return 1
+        return EXIT_INVALID

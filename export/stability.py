@@ -19,7 +19,7 @@ from export.options import require_folder_of
 from msdgs_serve.scene.errors import InvalidInput
 
 UNSTABLE = 3
-"""Exit status if the model is unstable; 1 is an error."""
+"""Exit status if the model is unstable; 2 is an error."""
 
 
 def main(
@@ -40,7 +40,7 @@ def main(
 
     python export/stability.py runs/ball/model.pt --plot stability.png
 
-    The exit status is 0 if float32 is as good as float64, 3 if it isn't, and 1 if the file can't be read.
+    The exit status is 0 if float32 is as good as float64, 3 if it isn't, and 2 if the file can't be read.
 
     Args:
         model: The `model.pt` of a training run.

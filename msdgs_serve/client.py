@@ -196,7 +196,7 @@ class Client:
         return _frame(pixels, channels, response.headers)
 
     def render_file(self, camera: Camera, t: Time, *, format: Format = "png", **options: Any) -> bytes:
-        """Return a frame as an image file, for a list of times a ZIP of them; `options` are those of `request_body`."""
+        """Return a frame as an image file; `options` are those of `request_body`."""
         return self._call("POST", "/render", json=request_body(camera, t, format=format, **options)).content
 
     def render_many(self, bodies: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, bytes | Problem]]:

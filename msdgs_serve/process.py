@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+EXIT_INVALID = 2  # wrong arguments, or files that can't be used
 EXIT_INTERRUPTED = 130  # the exit code of a shell for a program that Ctrl-C has stopped
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """The signals of Ctrl-C, of the end of a service or a machine, and of a terminal that is closed."""

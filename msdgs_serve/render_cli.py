@@ -1,7 +1,4 @@
-"""`msdgs-render`: render a camera path through scenes as images or a video, on this machine or a Ray cluster.
-
-Continues where an earlier run was stopped.
-"""
+"""`msdgs-render`: render a camera path through scenes as images or a video, on this machine or a Ray cluster."""
 
 import argparse
 import hashlib
@@ -26,7 +23,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
 from msdgs_serve.imaging.formats import default_channels
-from msdgs_serve.process import EXIT_INTERRUPTED
+from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
@@ -35,11 +32,11 @@ from msdgs_serve.video import PIXELS, VIDEO_FORMATS, VideoFormat, check_size, pi
 from msdgs_serve.writing import in_words, replacing, write_text, writing
 
 PROGRAM = "msdgs-render"
-USAGE_ERROR = 2
 RECORD = "msdgs-render.json"
 
-EXAMPLES = """\
-examples:
+DESCRIPTION = """\
+Render a camera path through scenes as images or a video, on this machine or a Ray cluster.
+
   msdgs-render scene.onnx frames/                           one turn around the scene over its time range, as PNG
   msdgs-render scene.onnx turn.mp4 --frames 96 --fps 24     the same as a video
   msdgs-render scene.onnx walk.webm --path camera_path.json a path saved by nerfstudio's viewer
@@ -61,36 +58,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
     except (MsdgsError, OSError) as error:
         print(f"{PROGRAM}: {in_words(error)}", file=sys.stderr)
-        return USAGE_ERROR
+        return EXIT_INVALID
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        PROGRAM, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
+        PROGRAM,
+        usage="%(prog)s [-h] [OPTIONS] SCENE OUT",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    scene = 'a scene file (.onnx), or a camera path (.json) in which each camera names one as "scene"'
-    parser.add_argument("scene", type=Path, help=scene)
-    parser.add_argument("out", type=Path, help="a folder for images, or a video: name.mp4, name.webm or name.webp")
-    parser.add_argument(
-        "--path", type=Path, help="a camera path in nerfstudio's format; default: one turn around the scene"
-    )
-    parser.add_argument("--frames", type=int, default=60, help="frames of the turn (default 60)")
-    parser.add_argument("--elevation", type=float, default=20.0, help="elevation of the turn, degrees (default 20)")
-    parser.add_argument(
-        "--fps", type=float, help=f"frames per second of a video; default: the path's, else {DEFAULT_FPS:g}"
-    )
-    parser.add_argument(
-        "--width", type=int, help="image width, pixels; default: the path's, else the scene's first camera's"
-    )
-    parser.add_argument("--height", type=int, help="image height, pixels; required with --width")
-    parser.add_argument("--format", choices=get_args(ImageFormat), default="png", help="format of images (default png)")
-    parser.add_argument("--quality", type=int, help="quality of jpeg and webp, 1 to 100")
-    motion = "exr and npy also hold motion vectors from each frame's time to so much later, in the scene's time"
-    parser.add_argument("--dt", type=float, help=motion)
-    parser.add_argument("--transparent", action="store_true", help="render images without a background")
-    ray = "render on a Ray cluster: `auto` for that of this machine (started if there is none), or its address"
-    parser.add_argument("--ray", metavar="ADDRESS", help=ray)
+    add = parser.add_argument
+    scene = 'Scene file (.onnx), or camera path (.json) in which each camera names one as "scene".'
+    add("scene", type=Path, metavar="SCENE", help=scene)
+    add("out", type=Path, metavar="OUT", help="Folder for images, or video: name.mp4, name.webm or name.webp.")
+    path = "Camera path in nerfstudio's format; by default one turn around the scene."
+    add("--path", type=Path, metavar="PATH", help=path)
+    add("--frames", type=int, metavar="INT", default=60, help="Frames of the turn. (default: 60)")
+    elevation = "Elevation of the turn, degrees. (default: 20)"
+    add("--elevation", type=float, metavar="FLOAT", default=20.0, help=elevation)
+    fps = f"Frames per second of a video; by default the path's, else {DEFAULT_FPS:g}."
+    add("--fps", type=float, metavar="FLOAT", help=fps)
+    width = "Image width, pixels; by default the path's, else that of the scene's first camera."
+    add("--width", type=int, metavar="INT", help=width)
+    add("--height", type=int, metavar="INT", help="Image height, pixels; required with --width.")
+    add("--format", choices=get_args(ImageFormat), default="png", help="Format of images. (default: png)")
+    add("--quality", type=int, metavar="INT", help="Quality of jpeg and webp, 1 to 100.")
+    motion = "For exr and npy: add motion vectors from each frame's time to this much later, in the scene's time."
+    add("--dt", type=float, metavar="FLOAT", help=motion)
+    add("--transparent", action="store_true", help="Render images without a background.")
+    ray = "Render on a Ray cluster: `auto` for that of this machine (started if there is none), or its address."
+    add("--ray", metavar="ADDRESS", help=ray)
     return parser
 
 

@@ -10,20 +10,20 @@ import time
 from collections.abc import Sequence
 
 from pydantic import ValidationError
-from pydantic_settings import SettingsError
 
 from msdgs_serve.api.app import create_app
+from msdgs_serve.api.arguments import PROGRAM, read_settings
 from msdgs_serve.api.observe import JsonLines
 from msdgs_serve.api.openapi import render_examples
 from msdgs_serve.api.server import Server
-from msdgs_serve.api.settings import PROGRAM, Settings
+from msdgs_serve.api.settings import Settings
+from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.rasterizer.precompile import compile_kernels
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import MsdgsError
 from msdgs_serve.store import SceneStore
 from msdgs_serve.threads import THREADS_VARIABLE
 
-USAGE_ERROR = 2
 SEND_BUFFER = 1 << 17
 """Bytes of a response in the system's buffer. A larger one empties in steps that take a slow client longer than the
 time limit on reading, which then closes its connection although it reads."""
@@ -52,20 +52,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         pass
     except (UsageError, MsdgsError) as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
-        return USAGE_ERROR
+        return EXIT_INVALID
     print("Stopped.", flush=True)
     return 0
 
 
 def _settings(arguments: Sequence[str]) -> Settings:
     try:
-        settings = Settings.from_arguments(arguments)
+        settings = read_settings(arguments)
     except ValidationError as error:
         errors = [item for item in error.errors() if item["type"] != "default_factory_not_called"]  # follows another
         wrong = [f"--{item['loc'][0]}: {item['msg']}".replace("_", "-") for item in errors]
         raise UsageError("; ".join(wrong)) from None
-    except SettingsError as error:
-        raise UsageError(str(error)) from None
     if not (settings.scenes or settings.compile):
         raise UsageError(f"no scene given; `{PROGRAM} scene.onnx` serves one, see `{PROGRAM} --help`")
     return settings

@@ -49,6 +49,9 @@ MESSAGES = {
 }
 """Messages by pydantic's types of errors, where its own are in terms of Python."""
 
+REMOVED = {"min_psnr": "isn't a field any more; `scene` names the file to use, and `GET /scenes/{name}` has its error"}
+"""Messages by fields of earlier versions."""
+
 MEDIA_TYPE = "application/problem+json"
 MAX_BODY_BYTES = 8192
 MAX_ERRORS = 20
@@ -230,6 +233,8 @@ def _field_error(item: Mapping[str, Any]) -> FieldError:
 
 def message_of(item: Mapping[str, Any]) -> str:
     """Return the text of one of pydantic's errors."""
+    if item["type"] == "extra_forbidden" and item["loc"][-1] in REMOVED:
+        return REMOVED[item["loc"][-1]]
     return MESSAGES[item["type"]].format(**item.get("ctx", {})) if item["type"] in MESSAGES else item["msg"]
 
 

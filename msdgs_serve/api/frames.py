@@ -1,9 +1,7 @@
 """Plan and render the frames of a request, from its values to the encoded file and the response headers."""
 
 import hashlib
-import io
 import json
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -15,7 +13,6 @@ from fastapi import Header
 
 from msdgs_serve import __version__
 from msdgs_serve.api.cameras import resolve_camera
-from msdgs_serve.api.choice import fastest_within, worst_decibels
 from msdgs_serve.api.schemas import RenderRequest
 from msdgs_serve.api.service import Service
 from msdgs_serve.imaging import FORMATS, Channel, DepthRange, Image, encode
@@ -30,8 +27,6 @@ IfNoneMatch = Annotated[
     str | None, Header(max_length=8192, description="`ETag`s of the client's cached versions", examples=['"0123"'])
 ]
 Result = TypeVar("Result")
-ZIP = "application/zip"
-ZIP_DATE = (1980, 1, 1, 0, 0, 0)  # the first date that ZIP supports; equal requests give equal bytes
 
 
 @dataclass(frozen=True)
@@ -50,12 +45,11 @@ class FramePlan:
     @property
     def media_type(self) -> str:
         """Media type of the response."""
-        several = isinstance(self.request.t, list) and self.request.format != "npy"
-        return ZIP if several else FORMATS[self.request.format].media_type
+        return FORMATS[self.request.format].media_type
 
     def headers(self, max_age: int, *, needs_key: bool = False) -> dict[str, str]:
         """Return the response headers, which don't depend on the rendering."""
-        error = worst_decibels(self.scene)
+        error = _worst_decibels(self.scene)
         caches = "private" if needs_key else "public"
         return {
             "ETag": self.etag,
@@ -71,8 +65,6 @@ class FramePlan:
 def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     """Check a request and return its plan; may load the scene. Raises `MsdgsError`."""
     scene = service.scene(request.scene)
-    if request.min_psnr is not None:
-        scene = fastest_within(service.store, scene, request.min_psnr)
     camera = resolve_camera(request, scene)
     times = request.t if isinstance(request.t, list) else [request.t]
     _check_amounts(service, request, camera, len(times))
@@ -115,14 +107,9 @@ async def draw_plan(service: Service, plan: FramePlan, job: RenderJob) -> bytes:
     """
     if not isinstance(plan.request.t, list):
         return await _queued(service, partial(draw_frame, service, plan, plan.times[0]), job, part=False)
-    if plan.request.format == "npy":
-        draw = partial(_draw_numbers, service, plan)
-        arrays = [await _queued(service, partial(draw, t), job, part=True) for t in plan.times]
-        return await service.queue.run(lambda: npy(np.stack(arrays)), job, part=True)
-    draw = partial(draw_frame, service, plan)
-    files = [await _queued(service, partial(draw, t), job, part=True) for t in plan.times]
-    extension = FORMATS[plan.request.format].extension
-    return await service.queue.run(lambda: _zipped(files, extension), job, part=True)
+    draw = partial(_draw_numbers, service, plan)
+    arrays = [await _queued(service, partial(draw, t), job, part=True) for t in plan.times]
+    return await service.queue.run(lambda: npy(np.stack(arrays)), job, part=True)
 
 
 async def _queued(service: Service, draw: Callable[[RenderJob], Result], total: RenderJob, *, part: bool) -> Result:
@@ -164,16 +151,18 @@ def _etag(scene: ServedScene, request: RenderRequest) -> str:
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'
 
 
-def _zipped(files: Sequence[bytes], extension: str) -> bytes:
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as archive:
-        for number, file in enumerate(files):
-            archive.writestr(zipfile.ZipInfo(f"frame_{number:05d}{extension}", ZIP_DATE), file)
-    return packed.getvalue()
+def _worst_decibels(scene: ServedScene) -> float | None:
+    """Return the file's measured PSNR of the worst frame against the full model, or None."""
+    rendered = scene.session.scene.metadata.measured_error.get("rendered")
+    value = rendered.get("psnr_worst") if isinstance(rendered, dict) else None
+    return float(value) if isinstance(value, int | float) else None
 
 
 def _check_amounts(service: Service, request: RenderRequest, camera: Camera, frames: int) -> None:
     limits = service.settings
+    if isinstance(request.t, list) and request.format != "npy":
+        expected = "one time, except for `npy`; `POST /render/batch` renders many frames"
+        raise InvalidInput("t", expected, f"a list for `{request.format}`")
     if frames > limits.max_batch:
         raise InvalidInput("t", f"a list of at most {limits.max_batch} times", frames)
     if request.shutter is not None and request.shutter.samples > limits.max_samples:

@@ -3,7 +3,7 @@
 import hashlib
 import hmac
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from http import HTTPStatus
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
@@ -44,13 +44,9 @@ class Key(NamedTuple):
 
 
 def client_of(scope: Scope) -> str:
-    """Return the identifier of a client, by which resources are shared: its key, or else its address."""
-    return scope.get(CLIENT) or address_of(scope.get("client"))
-
-
-def address_of(client: Sequence[object] | None) -> str:
-    """Return the address of a connection, or the one that a trusted proxy forwards."""
-    return str(client[0]) if client else "unknown"
+    """Return the identifier of a client, by which resources are shared: its key, or else its address, which a trusted
+    proxy may forward."""
+    return scope.get(CLIENT) or (scope.get("client") or ("unknown",))[0]
 
 
 def scope_of(method: str, path: str) -> KeyScope | None:

@@ -20,7 +20,6 @@ Index = Annotated[int, Field(strict=True, ge=0, le=1_000_000)]
 Samples = Annotated[int, Field(strict=True, ge=1, le=10_000)]
 Quality = Annotated[int, Field(strict=True, ge=1, le=100)]
 Unit = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1)]
-Decibels = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=200)]
 Steps = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=1000)]
 
 # query parameters, which are strings
@@ -28,7 +27,6 @@ LaxNumber = Annotated[float, Field(allow_inf_nan=False, ge=-1e9, le=1e9)]
 LaxPixels = Annotated[int, Field(ge=1, le=MAX_PIXELS_PER_SIDE)]
 LaxIndex = Annotated[int, Field(ge=0, le=1_000_000)]
 LaxQuality = Annotated[int, Field(ge=1, le=100)]
-LaxDecibels = Annotated[float, Field(allow_inf_nan=False, ge=0, le=200)]
 LaxSteps = Annotated[float, Field(allow_inf_nan=False, ge=0, le=1000)]
 List = Annotated[str, Field(max_length=100)]
 

@@ -6,7 +6,7 @@ import logging
 import random
 import re
 import time
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import quote
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -38,7 +38,7 @@ class Observe:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        token = request_id.set(usable_id(dict(scope["headers"]).get(IDENTITY, b"")))
+        token = request_id.set(_usable_id(dict(scope["headers"]).get(IDENTITY, b"")))
         answer, path = _Answer(send), route_path(scope)
         started = time.perf_counter()
         try:
@@ -54,38 +54,22 @@ class Observe:
             request_id.reset(token)
 
     def _record(self, scope: Scope, path: str, answer: "_Answer", seconds: float) -> None:
+        """Count and log a request."""
+        method = scope["method"] if scope["method"] in METHODS else UNKNOWN_METHOD
         route = getattr(scope.get("route"), "path", "unmatched")
-        answered = Answered(scope["method"], path, route, answer.status or 0, scope.get(KIND), seconds, answer.sent)
-        record(self._metrics, answered, scope.get("client"))
-
-
-class Answered(NamedTuple):
-    """A finished request."""
-
-    method: str
-    path: str
-    route: str
-    status: int  # 0 if there was no response
-    kind: str | None  # of the problem, if known
-    seconds: float
-    sent: int  # bytes of the body
-
-
-def record(metrics: Metrics, request: Answered, client: tuple[str, int] | None) -> None:
-    """Count and log a request."""
-    method = request.method if request.method in METHODS else UNKNOWN_METHOD
-    metrics.count_request(method, request.route, request.status, request.seconds, request.sent)
-    if request.kind is not None or request.status >= FIRST_ERROR:  # a kind with status 200: it was cut off
-        metrics.count_problem(request.kind or f"status_{request.status}")
-    facts = {
-        "method": method,
-        "path": request.path,
-        "status": request.status,
-        "milliseconds": round(1000 * request.seconds, 2),
-        "bytes": request.sent,
-        "client": (client or ("unknown",))[0],
-    }
-    access_log.info("%s %s %d", method, quote(request.path), request.status, extra={"facts": facts})
+        status, kind = answer.status or 0, scope.get(KIND)  # 0: there was no response
+        self._metrics.count_request(method, route, status, seconds, answer.sent)
+        if kind is not None or status >= FIRST_ERROR:  # a kind with status 200: it was cut off
+            self._metrics.count_problem(kind or f"status_{status}")
+        facts = {
+            "method": method,
+            "path": path,
+            "status": status,
+            "milliseconds": round(1000 * seconds, 2),
+            "bytes": answer.sent,
+            "client": (scope.get("client") or ("unknown",))[0],
+        }
+        access_log.info("%s %s %d", method, quote(path), status, extra={"facts": facts})
 
 
 class _Answer:
@@ -125,7 +109,7 @@ class JsonLines(logging.Formatter):
         return json.dumps(line)
 
 
-def usable_id(given: bytes) -> str:
+def _usable_id(given: bytes) -> str:
     """Return a client's request id, or a new one if it isn't valid."""
     text = given.decode("latin-1")
     return text if USABLE_ID.fullmatch(text) else f"{random.getrandbits(128):032x}"

@@ -33,8 +33,8 @@ def _file(description: str, media_types: Iterable[str], **headers: str) -> Respo
 
 
 IMAGE_RESPONSE = _file(
-    "The frame, or a ZIP file of frames at several times",
-    [*(traits.media_type for traits in FORMATS.values()), "application/zip"],
+    "The frame",
+    [traits.media_type for traits in FORMATS.values()],
     ETag="ETag of scene file and request",
     Server_Timing="milliseconds by stage: queue, pose (cached or not), draw, encode",
     Msdgs_Scene="the scene's name, percent-encoded",

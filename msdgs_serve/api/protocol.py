@@ -11,10 +11,8 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.errors import MEDIA_TYPE, problem_response
 
-NOTHING_BUFFERED = (b"", False)  # no data, and the connection is open
 READ_BYTES = 1 << 16
 """Bytes of its response, or all that are left, that a client reads in each `read_seconds`."""
 
@@ -23,19 +21,11 @@ class LimitedProtocol(H11Protocol):
     """Closes connections whose headers take longer than `header_seconds` or that read less than `READ_BYTES` in
     `read_seconds`. The rest of a body that was answered before it was complete has `header_seconds` too."""
 
-    def __init__(
-        self,
-        *arguments: Any,
-        header_seconds: float,
-        read_seconds: float,
-        early_rejection: EarlyRejection | None = None,
-        **keywords: Any,
-    ) -> None:
+    def __init__(self, *arguments: Any, header_seconds: float, read_seconds: float, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
         self.conn = _HeadWithBody(h11.SERVER)
         self._header_seconds = header_seconds
         self._read_seconds = read_seconds
-        self._doorman = early_rejection
         self._header_timer: asyncio.TimerHandle | None = None
         self._read_timer: asyncio.TimerHandle | None = None
         self._unsent = 0
@@ -52,8 +42,6 @@ class LimitedProtocol(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Stop the time limit when the headers are complete, and start one for what no application reads."""
-        if self._is_rejected_early(data):
-            return
         is_rest = self.conn.our_state is h11.DONE
         super().data_received(data)
         if not self._is_unread() or (is_rest and self.conn.their_state is h11.IDLE):
@@ -85,20 +73,6 @@ class LimitedProtocol(H11Protocol):
     def send_400_response(self, msg: str) -> None:
         """Answer invalid HTTP with a problem."""
         self._send_problem(http.HTTPStatus.BAD_REQUEST, "Not a valid HTTP/1.1 request, or its headers are too long.")
-
-    def _is_rejected_early(self, data: bytes) -> bool:
-        """Whether `data` was a request that was rejected early; h11 doesn't see it then."""
-        between = self.conn.their_state is h11.IDLE and self.conn.our_state is h11.IDLE
-        if self._doorman is None or not between or self.conn.trailing_data != NOTHING_BUFFERED:
-            return False
-        answer = self._doorman.answer(data, self.client, self.server_state.default_headers)
-        if answer is None:
-            return False
-        self._header_timer = _cancelled(self._header_timer)
-        self._unset_keepalive_if_required()
-        self.transport.write(answer)
-        self.timeout_keep_alive_task = self.loop.call_later(self.timeout_keep_alive, self.timeout_keep_alive_handler)
-        return True
 
     def _is_unread(self) -> bool:
         """Whether no application reads what the client sends: headers, or the rest of a body after the response."""

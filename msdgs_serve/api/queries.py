@@ -12,7 +12,7 @@ from msdgs_serve.scene.baked import SceneMetadata
 DEFAULT_VIEW = {"azimuth": 30.0, "elevation": 20.0}
 ORBIT_FIELDS = ("azimuth", "elevation", "distance")
 LOOK_AT_FIELDS = ("target", "up", "fov_y")
-PASSED_ON = ("scene", "min_psnr", "steps", "dt", "width", "height", "format", "quality")
+PASSED_ON = ("scene", "steps", "dt", "width", "height", "format", "quality")
 
 
 def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:

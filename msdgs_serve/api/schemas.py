@@ -7,7 +7,6 @@ from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag
 from msdgs_serve.api.camera_paths import MAX_TIMES, NerfstudioPath
 from msdgs_serve.api.numbers import (
     Color,
-    Decibels,
     Direction,
     Distance,
     Elevation,
@@ -15,7 +14,6 @@ from msdgs_serve.api.numbers import (
     Focal,
     FramesPerSecond,
     Index,
-    LaxDecibels,
     LaxIndex,
     LaxNumber,
     LaxPixels,
@@ -154,19 +152,12 @@ class ShutterSpec(Strict):
 
 
 class RenderRequest(Strict):
-    """A frame to render, or one for each of several times."""
+    """A frame to render."""
 
     scene: Name | None = Field(default=None, description="name of the scene; optional if only one is served")
-    min_psnr: Decibels | None = Field(
-        default=None,
-        description="use the fastest file of the scene's model whose worst frame has at least this PSNR in dB: "
-        "`walk.onnx` or one of `walk.….onnx` beside it. `Msdgs-Scene`, `-Plan` and `-Error` name the file used",
-        examples=[40],
-    )
     camera: CameraSpec
     t: Times = Field(
-        description="time within the scene's `time_range`; or a list of times, for which the response is a ZIP file of "
-        "images, or for `npy` one array [T, H, W, C]",
+        description="time within the scene's `time_range`; for `npy` also a list of times, for one array [T, H, W, C]",
         examples=[0.5],
     )
     width: Pixels | None = Field(
@@ -219,7 +210,6 @@ class RenderQuery(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     scene: Name | None = Field(default=None, description="optional if only one is served")
-    min_psnr: LaxDecibels | None = Field(default=None, description="dB, as in `POST /render`")
     t: LaxNumber | None = Field(default=None, description="default: the scene's first time")
     dt: LaxNumber | None = Field(default=None, description="scene time; `motion` needs it")
     steps: LaxSteps | None = Field(default=None, description="as in `POST /render`")

@@ -10,7 +10,6 @@ from types import FrameType
 import uvicorn
 from fastapi import FastAPI
 
-from msdgs_serve.api.early_rejection import EarlyRejection
 from msdgs_serve.api.keys import client_of
 from msdgs_serve.api.protocol import LimitedProtocol
 from msdgs_serve.api.service import Phase, Service
@@ -28,13 +27,7 @@ class Server(uvicorn.Server):
 
     def __init__(self, app: FastAPI, settings: Settings) -> None:
         self.service: Service = app.state.service
-        # with API keys or CORS, a rejection depends on headers that only the application checks
-        is_simple = settings.api_keys_file is None and not settings.cors_origins
-        early_rejection = (
-            EarlyRejection(self.service.queue, self.service.metrics, settings.max_body_bytes) if is_simple else None
-        )
-        limits = {"header_seconds": settings.header_seconds, "read_seconds": settings.read_seconds}
-        protocol = partial(LimitedProtocol, **limits, early_rejection=early_rejection)
+        protocol = partial(LimitedProtocol, header_seconds=settings.header_seconds, read_seconds=settings.read_seconds)
         config = uvicorn.Config(
             app,
             http=protocol,  # pyright: ignore[reportArgumentType]

@@ -1,33 +1,20 @@
 """Settings of the service, from flags and from the environment."""
 
-import json
 import os
-from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BaseModel, Field
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError
-from pydantic_settings import (
-    BaseSettings,
-    CliImplicitFlag,
-    CliPositionalArg,
-    CliSettingsSource,
-    EnvSettingsSource,
-    PydanticBaseSettingsSource,
-    SettingsConfigDict,
-)
+from pydantic_settings import BaseSettings, EnvSettingsSource, PydanticBaseSettingsSource, SettingsConfigDict
 
 from msdgs_serve.api.prefix import read_prefix
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.store import SceneStore
 from msdgs_serve.threads import thread_count
-
-PROGRAM = "msdgs-serve"
 
 
 def one_per_thread(settings: dict[str, Any]) -> int:
@@ -43,119 +30,121 @@ def _prefix(text: str) -> str:
         raise PydanticCustomError("prefix", message, {"given": text[:100]}) from None
 
 
-class Settings(BaseSettings):
-    """\
-    Serve scenes over HTTP: POST /render returns a frame for any camera and any time.
+class CommonSettings(BaseModel):
+    """Settings of most services."""
 
-      msdgs-serve scene.onnx                  one scene
-      msdgs-serve scenes/ --port 9000         every .onnx file of a folder; files may be added, changed and removed
-      msdgs-serve --compile                   compile the kernels for later starts, and exit
-      MSDGS_SCENES=scenes/ msdgs-serve        every flag is also an environment variable with the prefix MSDGS_
-
-    `python export/to_onnx.py model.pt` writes a scene file. The running service documents its API at /docs.
-    """
-
-    model_config = SettingsConfigDict(
-        env_prefix="MSDGS_",
-        cli_prog_name=PROGRAM,
-        cli_kebab_case=True,
-        cli_hide_none_type=True,
-        extra="ignore",
-        env_ignore_empty=True,
+    host: str = Field(default="127.0.0.1", description="Address to listen on; 0.0.0.0 for all networks.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 for a free one.")
+    threads: int | None = Field(default=None, ge=1, le=256, description="Render threads; by default one per core.")
+    cache_megabytes: int = Field(default=256, ge=0, description="Memory of the cache of posed Gaussians.")
+    scenes_memory_megabytes: int = Field(
+        default=2048, ge=1, description="Memory of all loaded scenes; those not requested for longest are unloaded."
+    )
+    api_keys_file: Path | None = Field(
+        default=None,
+        description="File with `scopes key` per line, scopes of read, write, operate; requests need a key then.",
+    )
+    cors_origins: list[str] = Field(
+        default=[],
+        description="Origins of web pages that may call, such as https://example.org, joined by commas; or *.",
+    )
+    proxies: str = Field(
+        default="127.0.0.1",
+        description="Addresses of trusted proxies for X-Forwarded-For, -Proto and -Prefix, joined by commas; or *.",
+    )
+    root_path: Annotated[str, AfterValidator(_prefix)] = Field(
+        default="", description="Path below which a proxy serves, such as /msdgs; X-Forwarded-Prefix replaces it."
+    )
+    frame_max_age: int = Field(
+        default=0, ge=0, description="Seconds that caches may keep a frame without revalidation."
+    )
+    watch_seconds: float = Field(default=1.0, gt=0, description="Interval of checking files for changes.")
+    drain_seconds: float = Field(default=30.0, ge=0, description="How long a stopping service finishes its requests.")
+    compile: bool = Field(
+        default=False, description="Compile kernels for this kind of processor and exit; needs no scene."
     )
 
-    scenes: CliPositionalArg[list[Path]] = Field(
-        default=[], description="scene files (.onnx) and folders of them; in the environment joined by ':'"
-    )
-    host: str = Field(default="127.0.0.1", description="address to listen on; 0.0.0.0 for all networks")
-    port: int = Field(default=8000, ge=0, le=65535, description="port to listen on; 0 for a free one")
+
+class LimitSettings(BaseModel):
+    """Limits of requests and scenes."""
+
     max_pixels: int = Field(
-        default=4096 * 2160, ge=1, description="largest width × height of a frame, multiplied by the number of times"
+        default=4096 * 2160, ge=1, description="Largest width × height of a frame, multiplied by the number of times."
     )
-    max_body_bytes: int = Field(default=1 << 20, ge=1024, description="largest request body")
-    threads: int | None = Field(default=None, ge=1, le=256, description="render threads; default: one per core")
+    max_samples: int = Field(default=64, ge=1, description="Most samples of a frame's motion blur.")
+    max_batch: int = Field(default=256, ge=1, le=1000, description="Most frames of a batch, and times of a request.")
+    max_video_frames: int = Field(default=300, ge=1, le=1000, description="Most frames of a video.")
+    max_video_pixels: int = Field(default=1 << 30, ge=1, description="Largest width × height × frames of a video.")
     concurrent_renders: int = Field(
         default_factory=one_per_thread,
         ge=1,
         le=64,
-        description="frames rendered at once, by default as many as threads; others wait",
+        description="Frames rendered at once, by default as many as threads; others wait.",
     )
     queued_renders: int = Field(
         default=32,
         ge=0,
         le=10_000,
-        description="frames that may wait, at most half of them of one client, and a quarter for its videos and "
-        "batches; others get a 503",
+        description="Frames that may wait, at most half of them of one client, and a quarter for its videos and "
+        "batches; others get a 503.",
     )
-    render_seconds: float = Field(default=30.0, gt=0, le=3600, description="time limit of a frame, including waiting")
-    cache_megabytes: int = Field(default=256, ge=0, description="memory of the cache of posed Gaussians")
-    max_samples: int = Field(default=64, ge=1, description="most samples of a frame's motion blur")
-    max_batch: int = Field(default=256, ge=1, le=1000, description="most frames of a batch, and times of a request")
-    max_video_frames: int = Field(default=300, ge=1, le=1000, description="most frames of a video")
-    max_video_pixels: int = Field(default=1 << 30, ge=1, description="largest width × height × frames of a video")
-    max_scene_megabytes: int = Field(default=1024, ge=1, description="largest uploaded scene file")
-    max_scenes: int = Field(default=1000, ge=1, description="most scenes in the folder for uploads")
-    max_scenes_megabytes: int = Field(default=1 << 16, ge=1, description="most disk space of these scenes")
-    max_key_scenes: int = Field(default=100, ge=1, description="most scenes of one API key in that folder")
-    max_key_megabytes: int = Field(default=1 << 13, ge=1, description="most disk space of the scenes of one API key")
-    min_free_megabytes: int = Field(default=1024, ge=0, description="disk space that uploads leave free")
-    max_scene_memory_megabytes: int = Field(
-        default=2048, ge=1, description="most memory for the values of one call of a scene's graph and for all poses"
-    )
-    scenes_memory_megabytes: int = Field(
-        default=2048, ge=1, description="memory of all loaded scenes; those not requested for longest are unloaded"
-    )
-    max_scene_gaussians: int = Field(default=40_000_000, ge=1, description="most Gaussians of a scene")
-    max_scene_operations: float = Field(
-        default=1e13, gt=0, description="most operations of a scene's graph for one frame"
-    )
-    trial_seconds: float = Field(
-        default=60.0, gt=0, le=3600, description="time limit for opening an uploaded scene and posing it at three times"
-    )
-    uploads: CliImplicitFlag[bool] = Field(
-        default=False, description="let clients add and delete scenes, in the first folder given"
-    )
-    header_seconds: float = Field(default=10.0, gt=0, description="time limit for a request's headers")
+    render_seconds: float = Field(default=30.0, gt=0, le=3600, description="Time limit of a frame, including waiting.")
+    max_body_bytes: int = Field(default=1 << 20, ge=1024, description="Largest request body.")
+    header_seconds: float = Field(default=10.0, gt=0, description="Time limit for a request's headers.")
     body_seconds: float = Field(
-        default=10.0, gt=0, description="time limit for a request's body; for uploads, for each part of it"
+        default=10.0, gt=0, description="Time limit for a request's body; for uploads, for each part of it."
     )
-    read_seconds: float = Field(default=10.0, gt=0, description="time limit for reading each 64 KiB of a response")
+    read_seconds: float = Field(default=10.0, gt=0, description="Time limit for reading each 64 KiB of a response.")
     unread_megabytes: int = Field(
         default=512,
         ge=1,
-        description="memory of responses that clients have yet to read, about half of it for one client; new requests "
-        "for frames get a 503 meanwhile",
+        description="Memory of responses that clients have yet to read, about half of it for one client; new requests "
+        "for frames get a 503 meanwhile.",
     )
-    drain_seconds: float = Field(default=30.0, ge=0, description="how long a stopping service finishes its requests")
-    watch_seconds: float = Field(default=1.0, gt=0, description="interval of checking files for changes")
-    frame_max_age: int = Field(default=0, ge=0, description="seconds that caches may keep a frame without revalidation")
-    api_keys_file: Path | None = Field(
-        default=None,
-        description="file with `scopes key` per line, scopes of read, write, operate; requests need a key then",
+    max_scene_gaussians: int = Field(default=40_000_000, ge=1, description="Most Gaussians of a scene.")
+    max_scene_memory_megabytes: int = Field(
+        default=2048, ge=1, description="Most memory for the values of one call of a scene's graph and for all poses."
     )
-    proxies: str = Field(
-        default="127.0.0.1",
-        description="addresses of trusted proxies for X-Forwarded-For, -Proto and -Prefix, joined by commas; or *",
-    )
-    root_path: Annotated[str, AfterValidator(_prefix)] = Field(
-        default="", description="path below which a proxy serves, such as /msdgs; X-Forwarded-Prefix replaces it"
-    )
-    cors_origins: list[str] = Field(
-        default=[], description="origins of web pages that may call, such as https://example.org; or *"
-    )
-    compile: CliImplicitFlag[bool] = Field(
-        default=False, description="compile kernels for this kind of processor and exit; needs no scene"
-    )
-    log_format: Literal["text", "json"] = Field(default="text", description="`json`: one object per line")
-    log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="warning", description="`info` logs every request and invalid upload"
+    max_scene_operations: float = Field(
+        default=1e13, gt=0, description="Most operations of a scene's graph for one frame."
     )
 
-    @classmethod
-    def from_arguments(cls, arguments: Sequence[str]) -> "Settings":
-        """Return the settings of a command line. Raises pydantic's `ValidationError`, and `SettingsError`."""
-        flags = CliSettingsSource(cls, cli_parse_args=list(arguments), case_sensitive=False, parse_args_method=_parse)
-        return cls(_cli_settings_source=flags)  # pyright: ignore[reportCallIssue]
+
+class UploadSettings(BaseModel):
+    """Uploads and their limits."""
+
+    uploads: bool = Field(default=False, description="Let clients add and delete scenes, in the first folder given.")
+    max_scene_megabytes: int = Field(default=1024, ge=1, description="Largest uploaded scene file.")
+    max_scenes: int = Field(default=1000, ge=1, description="Most scenes in the folder for uploads.")
+    max_scenes_megabytes: int = Field(default=1 << 16, ge=1, description="Most disk space of these scenes.")
+    max_key_scenes: int = Field(default=100, ge=1, description="Most scenes of one API key in that folder.")
+    max_key_megabytes: int = Field(default=1 << 13, ge=1, description="Most disk space of the scenes of one API key.")
+    min_free_megabytes: int = Field(default=1024, ge=0, description="Disk space that uploads leave free.")
+    trial_seconds: float = Field(
+        default=60.0,
+        gt=0,
+        le=3600,
+        description="Time limit for opening an uploaded scene and posing it at three times.",
+    )
+
+
+class LogSettings(BaseModel):
+    """Format and level of the log."""
+
+    log_format: Literal["text", "json"] = Field(default="text", description="`json`: one object per line.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="warning", description="`info` logs every request and invalid upload."
+    )
+
+
+class Settings(LogSettings, UploadSettings, LimitSettings, CommonSettings, BaseSettings):
+    """All settings; what isn't given is read from the environment."""
+
+    model_config = SettingsConfigDict(env_prefix="MSDGS_", extra="ignore", env_ignore_empty=True)
+
+    scenes: list[Path] = Field(
+        default=[], description="Scene files (.onnx) and folders of them; in the environment joined by ':'."
+    )
 
     @property
     def graph_limits(self) -> GraphLimits:
@@ -171,17 +160,8 @@ class Settings(BaseSettings):
     def settings_customise_sources(
         cls, settings_cls: type[BaseSettings], init_settings: PydanticBaseSettingsSource, **_: Any
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Return the sources in order: flags (first in pydantic-settings), arguments, environment."""
+        """Return the sources in order: arguments, environment."""
         return init_settings, _Environment(settings_cls)
-
-
-def _parse(parser: ArgumentParser, arguments: Sequence[str] | None, namespace: Any) -> Namespace:
-    """Parse the command line. Paths become JSON, as pydantic-settings gives commas, brackets and quotes in other lists
-    a meaning."""
-    parsed = parser.parse_args(arguments, namespace)
-    if isinstance(parsed.scenes, list):
-        parsed.scenes = json.dumps(parsed.scenes)
-    return parsed
 
 
 def split_list(name: str, value: str) -> list[str]:

@@ -118,11 +118,6 @@ class WorkQueue:
             else:
                 call.future.add_done_callback(lambda _: self._leave(call))
 
-    def reject_if_full(self, client: str) -> None:
-        """Raise `RequestRejected` if a call that isn't streamed would not be admitted now."""
-        with self._lock:
-            self._reject_if_full(client)
-
     def close(self) -> None:
         """Reject new calls, and finish admitted ones."""
         self._closed = True
@@ -194,7 +189,7 @@ class WorkQueue:
 
     def _take_place(self, call: _Call, *, admitted_before: bool = False) -> None:
         if not admitted_before:
-            self._reject_if_full(call.client, streamed=call.streamed)
+            self._reject_if_full(call)
         for places in self._places_of(call):
             places[call.client] += 1
         call.has_place = True
@@ -211,15 +206,15 @@ class WorkQueue:
     def _places_of(self, call: _Call) -> list[Counter[str]]:
         return [self._held, self._streams] if call.streamed else [self._held]
 
-    def _reject_if_full(self, client: str, *, streamed: bool = False) -> None:
+    def _reject_if_full(self, call: _Call) -> None:
         if self._closed:
             detail = "The service is stopping; try again, another instance may answer."
             raise RequestRejected(HTTPStatus.SERVICE_UNAVAILABLE, "draining", detail, retry_after=1)
-        detail = _refusal(self._held, client, self._places, "work and in the queue")
-        if detail is None and streamed:
-            detail = _refusal(self._streams, client, max(1, self._places // 2), "batches and videos")
+        detail = _refusal(self._held, call.client, self._places, "work and in the queue")
+        if detail is None and call.streamed:
+            detail = _refusal(self._streams, call.client, max(1, self._places // 2), "batches and videos")
         if detail is None:
-            detail = _refusal_of_unread(self.unread(), client, self._max_unread)
+            detail = _refusal_of_unread(self.unread(), call.client, self._max_unread)
         if detail is None:
             return
         seconds = math.ceil(self._held.total() * self._mean_seconds / self._workers)

@@ -26,6 +26,7 @@ from export.plans.registry import build
 from export.to_onnx import main as to_onnx
 from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.trainer import Trainer
@@ -134,7 +135,7 @@ def test_the_seconds_of_a_scene_are_stored_if_they_are_given(tmp_path: Path, of:
     options = ExportOptions(model, tmp_path / "scene.onnx", quick=of == "model", duration=2.5, keep_float32=True)
     assert to_onnx(options) == 0
     assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.duration == 2.5
-    assert to_onnx(replace(options, duration=0)) == 1
+    assert to_onnx(replace(options, duration=0)) == EXIT_INVALID
     with serving(tmp_path / "scene.onnx") as client:
         assert client.get("/scenes/scene").json()["duration"] == 2.5
 
@@ -301,7 +302,7 @@ def test_the_scripts_run_from_any_folder_and_their_help_has_examples(tmp_path: P
         return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
 
     done = run(*arguments)
-    assert done.returncode == 1
+    assert done.returncode == EXIT_INVALID
     assert f"error: {arguments[0]}" in done.stderr
     assert f"python export/{script}.py" in run("--help").stdout
 

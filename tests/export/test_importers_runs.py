@@ -25,6 +25,7 @@ from export.options import ExportOptions
 from export.plans.registry import build
 from export.to_onnx import main as to_onnx
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -164,7 +165,7 @@ def test_a_run_whose_gaussians_fade_is_exported_by_plans_that_run_layers(
     scene = DeformationSession(tmp_path / "scene.onnx").scene
     assert (scene.metadata.layers, scene.changing) == (("plane",), ("opacities", "sh"))
     assert max(scene.metadata.measured_error[name] for name in scene.changing) <= tolerance("export.relative")
-    assert to_onnx(replace(options, plan="compact:50")) == 1
+    assert to_onnx(replace(options, plan="compact:50")) == EXIT_INVALID
     assert "`plan` must be one that runs layers (network, prefix)" in capsys.readouterr().err
 
 

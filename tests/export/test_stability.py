@@ -15,6 +15,7 @@ from export.precision.assess import assess
 from export.precision.formats import FLOAT32, FORMATS, in_format
 from export.precision.report import PlanUnsafe
 from export.stability import UNSTABLE, main
+from msdgs_serve.process import EXIT_INVALID
 from tests.export import stability_extreme, stability_rows, stability_stiff
 from tests.export.stability_rows import FAILS, Row
 from tests.export.stability_suite import TABLE
@@ -186,7 +187,7 @@ def test_the_command_flags_a_model_that_overflows(tmp_path: Path, capsys: pytest
 def test_the_command_refuses_invalid_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: dict[str, Any], message: str
 ):
-    assert main(saved(tmp_path, random_model(5)), **settings) == 1  # type: ignore[arg-type]
+    assert main(saved(tmp_path, random_model(5)), **settings) == EXIT_INVALID  # type: ignore[arg-type]
     assert message in capsys.readouterr().err
 
 

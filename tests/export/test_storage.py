@@ -28,6 +28,7 @@ from export.storage.kinds import Pack, directions, fractions, in_range, logarith
 from export.to_onnx import main
 from export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_train.gaussians.model_file import load_model
@@ -201,9 +202,9 @@ def test_a_scene_file_is_stored_anew(tmp_path: Path, kind: str):
     assert 37 < min(check.psnr(small.gaussians(t), t) for t in (0.13, 0.57, 0.91)) < 70
     before = out.read_bytes()
     for min_psnr in (101.0, 5.0):
-        assert convert_main(ConvertOptions(scene, out, min_psnr=min_psnr)) == 1
+        assert convert_main(ConvertOptions(scene, out, min_psnr=min_psnr)) == EXIT_INVALID
     scene.write_bytes(build("network", bake(random_model(1, layers=()), SCENE, "0" * 64)).SerializeToString())
-    assert convert_main(ConvertOptions(scene, out)) == 1  # all arrays are small
+    assert convert_main(ConvertOptions(scene, out)) == EXIT_INVALID  # all arrays are small
     assert out.read_bytes() == before
 
 

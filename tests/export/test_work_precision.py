@@ -22,6 +22,7 @@ from export.options import ExportOptions
 from export.pruning import RULES
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 from tests.support.tolerances import tolerance
@@ -171,7 +172,7 @@ def test_the_report_has_its_fields(swept: tuple[ExportJob, SweepResult], tmp_pat
 
 def test_an_error_that_cannot_be_reached_says_what_can(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = saved(tmp_path, random_model(60))
-    assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0)) == 1
+    assert main(ExportOptions(path, tmp_path / "s.onnx", plan="prefix:1", min_psnr=75.0)) == EXIT_INVALID
     shown = capsys.readouterr().err
     assert "at most" in shown
     assert "which the plan prefix:1 reaches" in shown
@@ -214,7 +215,7 @@ def test_invalid_options_are_refused_by_name(
     Path("text.pt").write_text("no model")
     Path("folder.pt").mkdir()
     wishes: dict[str, Any] = {"model": saved(tmp_path, random_model(60)), "output": tmp_path / "s.onnx"} | settings
-    assert main(ExportOptions(**wishes)) == 1
+    assert main(ExportOptions(**wishes)) == EXIT_INVALID
     shown = capsys.readouterr().err
     assert "error: " in shown
     assert message in shown

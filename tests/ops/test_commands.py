@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from msdgs_serve.process import EXIT_INTERRUPTED, STOPPING, stopped_by
+from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID, STOPPING, stopped_by
 from tests.support.processes import ROOT, run_python
 
 HANGING_IMPORT = """
@@ -62,6 +62,33 @@ def test_ctrl_c_during_imports_is_one_line(command: str, arguments: list[str], p
     assert errors.splitlines()[-1] == "interrupted"
     assert "Traceback" not in errors
     assert process.returncode == EXIT_INTERRUPTED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("command", "arguments", "number"),
+    [
+        ("msdgs-serve", ["a.onnx"], "--port"), ("msdgs-render", ["a.onnx", "frames"], "--frames"),
+        ("msdgs-train", ["synthetic", "out"], "--size"), ("python -m msdgs_train", ["fit", "data", "run"], "--steps"),
+        ("to_onnx.py", ["model.pt"], "--times"), ("convert.py", ["a.onnx", "a.ply"], "--frames"),
+        ("stability.py", ["model.pt"], "--times"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("is_known", [True, False])
+def test_wrong_arguments_are_named_and_the_exit_status_is_the_same(
+    command: str, arguments: list[str], number: str, is_known: bool, tmp_path: Path
+):
+    wrong = [number, "many"] if is_known else ["--surprise"]
+    done = subprocess.run(
+        [sys.executable, *COMMANDS[command], *arguments, *wrong],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == EXIT_INVALID, done.stderr
+    assert wrong[0] in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize("name", SCRIPTS)

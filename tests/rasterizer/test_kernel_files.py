@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from msdgs_serve.api.cli import USAGE_ERROR, main
+from msdgs_serve.api.cli import main
+from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.rasterizer.kernel_files import CheckedFiles, copy_kernels, is_writable
 from tests.support.processes import ROOT, run_python
 
@@ -265,5 +266,5 @@ def test_compiling_says_where_the_kernels_are() -> None:
 def test_compiling_for_nothing_is_refused(tmp_path: Path, capsys, monkeypatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "kernels"))
-    assert main(["--compile"]) == USAGE_ERROR
+    assert main(["--compile"]) == EXIT_INVALID
     assert "can't be written" in capsys.readouterr().err

@@ -99,9 +99,8 @@ INVALID |= dict.fromkeys(INTEGERS, NOT_INTEGERS) | dict.fromkeys(TRIPLES, NOT_TR
 def test_an_invalid_value_is_refused_by_the_name_of_its_field(client: httpx.Client, field: str):
     beside = {"format": "jpeg"} if field == "quality" else {}
     for value in [*INVALID.get(field, []), *OTHERS.get(field, [])]:
-        if (field, value) != ("t", [1]):  # a valid list of times
-            fields = refused(client, {**beside, **changed(field, value)})
-            assert all(name.startswith(field) for name in fields), value
+        fields = refused(client, {**beside, **changed(field, value)})
+        assert all(name.startswith(field) for name in fields), value
 
 
 @pytest.mark.parametrize("bad", NOT_FINITE, ids=lambda value: repr(value)[:12])
@@ -130,11 +129,11 @@ def test_every_number_of_a_matrix_is_checked(client: httpx.Client, bad: Any):
         ({"format": "png", "quality": 90}, "quality"),
         ({"format": "webp", "width": 16384, "height": 1}, "width"),
         ({"width": 101, "height": 100}, "width"),
-        ({"t": []}, "t"),
-        ({"t": [0.5] * 9}, "t"),
-        ({"t": [0.5, 2.0]}, "t"),
-        ({"t": [0.5, NAN]}, "t.1"),
-        ({"t": [0.0] * 5, "width": 100, "height": 30}, "t"),
+        ({"t": [], "format": "npy"}, "t"),
+        ({"t": [0.5] * 9, "format": "npy"}, "t"),
+        ({"t": [0.5, 2.0], "format": "npy"}, "t"),
+        ({"t": [0.5, NAN], "format": "npy"}, "t.1"),
+        ({"t": [0.0] * 5, "format": "npy", "width": 100, "height": 30}, "t"),
         ({"shutter": {"open": 0, "close": 0}}, "shutter.close"),
         ({"shutter": {"open": -0.6, "close": 0}}, "shutter.open"),
         ({"shutter": {"open": 0, "close": 0.6}}, "shutter.close"),

@@ -178,13 +178,11 @@ def test_a_service_writes_no_file_besides_its_scenes(tmp_path: Path, folder: Pat
 
 
 @pytest.mark.parametrize("milliseconds", [f"1{'0' * 400}", "1e999", "[" * 100_000 + "]" * 100_000])
-def test_a_poisoned_report_beside_a_scene_is_as_none(tmp_path: Path, milliseconds: str):
-    measured = {"rendered": {"psnr_worst": 50.0}}
-    write_scene(tmp_path / "good.onnx", measured_error=measured)
+def test_a_poisoned_report_beside_a_scene_is_refused(tmp_path: Path, milliseconds: str):
+    write_scene(tmp_path / "good.onnx")
     point = {"plan": "network", "error": {"psnr_worst": 50.0}, "milliseconds": {"total": {"min": "MILLISECONDS"}}}
     report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": [point]}
     text = json.dumps(report).replace('"MILLISECONDS"', milliseconds)
     (tmp_path / "good.report.json").write_text(text)
     with serving(tmp_path) as client:
         assert client.get("/scenes/good/report").status_code == 503
-        assert client.post("/render", json={**FRAME, "min_psnr": 40}).status_code == 200

@@ -13,6 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
+from msdgs_serve.api.arguments import GROUPS, read_settings
 from msdgs_serve.api.cli import addresses, main
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.threads import THREADS_VARIABLE
@@ -97,13 +98,21 @@ def test_in_a_container_it_prints_that_it_listens_everywhere(scene: Path):
     assert f"curl http://127.0.0.1:{match[1]}/render" in printed
 
 
-def test_help_shows_examples_and_options(capsys: pytest.CaptureFixture[str]):
+def test_help_shows_examples_and_each_option_in_its_group(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         main(["--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    for part in ("msdgs-serve scene.onnx", "MSDGS_SCENES=", "export/to_onnx.py", "--port", "--max-pixels", "/docs"):
+    for part in ("msdgs-serve scene.onnx", "MSDGS_SCENES=", "export/to_onnx.py", "/docs"):
         assert part in text
+    parts = dict(re.findall(r"^(\S.*):\n((?:  .*\n)+)", text, re.MULTILINE))
+    groups = {title: re.findall(r"^  --([\w-]+)", part, re.MULTILINE) for title, part in parts.items()}
+    assert {name: title for title, names in groups.items() for name in names} == {
+        name.replace("_", "-"): title for title, settings in GROUPS.items() for name in settings.model_fields
+    }
+    assert sum(map(len, groups.values())) == len(Settings.model_fields) - 1, "scenes are no option"
+    for default in ("null", "factory", "None", "default: )", "[]"):
+        assert default not in text
 
 
 @pytest.mark.parametrize(
@@ -117,7 +126,6 @@ def test_help_shows_examples_and_options(capsys: pytest.CaptureFixture[str]):
         (["balls.onnx", "--max-pixels", "many"], "--max-pixels: "),
         (["balls.onnx", "--host", "256.1.1.1"], "can't listen on 256.1.1.1"),
         (["balls.onnx", "--host", "256.1.1.1", "--uploads"], "`uploads` must be given with a folder"),
-        (["balls.onnx", "--cors-origins", "["], "cors_origins: "),
     ],
 )
 def test_errors_are_one_line(
@@ -174,14 +182,25 @@ def test_flags_win_over_the_environment(scene: Path, tmp_path: Path, monkeypatch
     monkeypatch.setenv("MSDGS_SCENES", f"{scene}:{tmp_path}")
     monkeypatch.setenv("MSDGS_PORT", "9000")
     monkeypatch.setenv("MSDGS_MAX_PIXELS", "500")
-    settings = Settings.from_arguments(["--port", "9001"])
+    settings = read_settings(["--port", "9001"])
     assert settings.scenes == [scene, tmp_path]
     assert (settings.port, settings.max_pixels) == (9001, 500)
-    settings = Settings.from_arguments(["other.onnx"])
+    settings = read_settings(["other.onnx"])
     assert settings.scenes == [Path("other.onnx")]
+
+
+def test_a_list_is_joined_by_commas_or_given_again():
+    settings = read_settings(["--cors-origins", "https://a.org,https://b.org", "--cors-origins", "https://c.org"])
+    assert settings.cors_origins == ["https://a.org", "https://b.org", "https://c.org"]
+
+
+@pytest.mark.parametrize(("flags", "uploads"), [([], True), (["--no-uploads"], False), (["--uploads"], True)])
+def test_a_switch_wins_over_the_environment(monkeypatch: pytest.MonkeyPatch, flags: list[str], uploads: bool):
+    monkeypatch.setenv("MSDGS_UPLOADS", "true")
+    assert read_settings(flags).uploads is uploads
 
 
 def test_any_path_is_one_scene():
     paths = [Path(name) for name in ("a,b.onnx", "[x].onnx", "{y", 'it"s.onnx', "it's.onnx", "3", " c\\", "null")]
-    settings = Settings.from_arguments([str(path) for path in paths])
+    settings = read_settings([str(path) for path in paths])
     assert settings.scenes == paths

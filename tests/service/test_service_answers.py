@@ -1,10 +1,8 @@
 """Channels and motion blur of frames, and the rest of their responses: versions, timings, ids, metrics."""
 
-import io
 import json
 import logging
 import re
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import httpx
 import numpy as np
 import pytest
 
+from msdgs_serve.api.errors import REMOVED
 from msdgs_serve.api.observe import JsonLines, request_id
 from msdgs_serve.imaging.display import FARTHEST_BRIGHTNESS
 from msdgs_serve.imaging.image import linear_to_srgb, srgb_to_linear
@@ -74,35 +73,21 @@ def test_headers_name_plan_channels_and_stages(client: httpx.Client):
     assert response.headers["Msdgs-Scene"] == "balls"
 
 
-def compared(psnr: float, **others: Any) -> dict[str, Any]:
-    return {"measured_error": {"rendered": {"psnr_worst": psnr}}, **others}
-
-
-def test_the_fastest_file_within_an_error_is_taken(tmp_path: Path):
-    write_scene(tmp_path / "walk.onnx", **compared(60))
-    write_scene(tmp_path / "walk.fast.onnx", **compared(40, plan="compact:40"))
-    write_scene(tmp_path / "walk.slow.onnx", **compared(50, plan="int8"))
-    write_scene(tmp_path / "walk.other.onnx", **compared(70, checkpoint_sha256="1" * 64))
+def test_the_measured_error_of_a_file_is_a_header(tmp_path: Path):
+    write_scene(tmp_path / "walk.onnx", measured_error={"rendered": {"psnr_worst": 60}})
     write_scene(tmp_path / "plain.onnx")
-    (tmp_path / "walk.broken.onnx").write_bytes(b"no scene")
-    (tmp_path / "uploads").mkdir()
-    write_scene(tmp_path / "uploads" / "walk.better.onnx", **compared(200))
-    points = [
-        {"plan": plan, "error": {"psnr_worst": psnr}, "milliseconds": {"total": {"min": milliseconds}}}
-        for plan, psnr, milliseconds in (("network", 60, 20.0), ("compact:40", 40, 5.0), ("int8", 50, 30.0))
-    ]
-    report = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": points}
-    (tmp_path / "walk.report.json").write_text(json.dumps(report))
-    with serving(tmp_path / "uploads", tmp_path) as client:
-        for min_psnr, name, error in ((30, "walk.fast", "40.00"), (45, "walk", "60.00"), (None, "walk", "60.00")):
-            answer = post(client, scene="walk", min_psnr=min_psnr)
-            assert (answer.status_code, answer.headers["Msdgs-Scene"]) == (200, name)
-            assert answer.headers["Msdgs-Error"] == error
-        link = client.get(f"/render?scene=walk&min_psnr=30&t=0.5&width={SIZE}&height={SIZE}")
-        assert (link.headers["Msdgs-Scene"], link.headers["Msdgs-Plan"]) == ("walk.fast", "compact:40")
-        for scene, min_psnr in (("walk", 65), ("plain", 10), ("walk", -1)):
-            check_problem(post(client, scene=scene, min_psnr=min_psnr), 422, "min_psnr")
+    with serving(tmp_path) as client:
+        assert post(client, scene="walk").headers["Msdgs-Error"] == "60.00"
         assert "Msdgs-Error" not in post(client, scene="plain").headers
+
+
+def test_a_removed_field_is_refused_with_what_replaces_it(client: httpx.Client):
+    batch = {"frames": [{**FRAME, "min_psnr": 40}]}
+    (line,) = client.post("/render/batch", json=batch).text.splitlines()
+    answers = [post(client, min_psnr=40), client.get("/render?min_psnr=40")]
+    for problem in (json.loads(line)["problem"], *(answer.json() for answer in answers)):
+        assert problem["status"] == 422
+        assert problem["errors"] == [{"field": "min_psnr", "message": REMOVED["min_psnr"]}]
 
 
 def test_get_equals_post(client: httpx.Client):
@@ -172,16 +157,17 @@ def test_an_invalid_video_is_refused_by_field(client: httpx.Client, body: dict[s
     check_problem(client.post("/render/video", json=body), 422, field)
 
 
-def test_several_times_are_several_files(client: httpx.Client):
-    response = post(client, t=[0.0, 0.5, 1.0])
-    assert response.headers["Content-Type"] == "application/zip"
-    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
-        files = [archive.read(name) for name in archive.namelist()]
-    assert files == [post(client, t=t).content for t in (0.0, 0.5, 1.0)]
-    assert post(client, t=[0.0, 0.5, 1.0]).content == response.content
+def test_several_times_are_one_array(client: httpx.Client):
     stacked = array(client, t=[0.0, 0.5])
     assert stacked.shape == (2, SIZE, SIZE, 5)
     np.testing.assert_array_equal(stacked[1], array(client, t=0.5))
+
+
+@pytest.mark.parametrize("image_format", ["png", "jpeg", "webp", "exr"])
+def test_several_times_of_images_are_refused_with_the_way_to_them(client: httpx.Client, image_format: str):
+    refused = post(client, t=[0.0, 0.5], format=image_format)
+    check_problem(refused, 422, "t")
+    assert "POST /render/batch" in refused.json()["detail"]
 
 
 def test_channels_come_in_the_order_asked_for(client: httpx.Client):
@@ -304,7 +290,8 @@ def test_metrics_are_what_the_client_counted(scene: Path):
         assert durations['{route="/render",status="200"}'] == durations['{route="/render",status="422"}'] == count
         assert numbers(client, "msdgs_stage_seconds_count")['{stage="encode"}'] == count
         video = {"frames": [{"camera": ORBIT, "t": t} for t in (0.0, 0.5, 1.0)], "width": 16, "height": 16}
-        assert post(client, t=[0.0, 0.5]).status_code == client.post("/render/video", json=video).status_code == 200
+        array(client, t=[0.0, 0.5])
+        assert client.post("/render/video", json=video).status_code == 200
         assert numbers(client, "msdgs_stage_seconds_count")['{stage="draw"}'] == count + 2 + 3, "by frame"
         lookups = numbers(client, "msdgs_pose_cache_lookups_total")
         assert sum(lookups.values()) == count + 2 + 3 + 1, "and one frame drawn at the start"

@@ -1,4 +1,4 @@
-"""Render a frame, or one for each of several times."""
+"""Render a frame."""
 
 from collections.abc import Callable
 from http import HTTPStatus
