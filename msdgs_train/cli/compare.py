@@ -13,9 +13,12 @@ from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.console import EXIT_INVALID, console, progress_bar, rich_table
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
+from msdgs_train.settings import optional
 
 if TYPE_CHECKING:
     from msdgs_train.comparison.pools import RunEnd
+
+ONE_OR_MORE_SYSTEMS = tyro.conf.arg(metavar="SYSTEM...", help_behavior_hint="(one or more)")
 
 
 @dataclass(frozen=True)
@@ -32,19 +35,19 @@ class Compare:
     mine.toml:  [k2]  preset = "msdgs-small"  [k4]  layers = ["mlp", "mlp:width=64", "mlp", "mlp"]
     """
 
-    systems: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG...")]
-    """Presets and TOML files."""
-    data: tuple[Path, ...]
+    systems: Annotated[tuple[str, ...], tyro.conf.Positional, ONE_OR_MORE_SYSTEMS]
+    """Names of presets, and TOML files."""
+    data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DATA...")]
     """Dataset folders, one or more."""
     out: Path
     """The folder of all runs and results: new, or one of the same comparison."""
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT...")] = (0, 1, 2)
     """One run per seed; the table shows mean and standard deviation."""
     budget: Annotated[Budget, tyro.conf.arg(name="")] = field(default_factory=Budget)
-    jobs: int | None = None
+    jobs: Annotated[int | None, optional("INT")] = None
     """Parallel runs; as many as the cores allow if not given. Parallel runs slow each other down somewhat; frame times
     are measured at the end, one after the other."""
-    ray: str | None = None
+    ray: Annotated[str | None, optional("ADDRESS")] = None
     """Train on a Ray cluster: its address, or `auto` for that of this machine, started if there is none. DATA and OUT
     must be at the same paths on all its machines."""
 

@@ -8,6 +8,9 @@ import tyro
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.console import console, frame_progress, rich_table
+from msdgs_train.settings import optional
+
+ONE_OR_MORE_RUNS = tyro.conf.arg(metavar="RUN...", help_behavior_hint="(one or more)")
 
 
 @dataclass(frozen=True)
@@ -24,10 +27,10 @@ class Eval:
     Two runs beside the same images:  msdgs-train eval runs/first runs/second --sheet first_and_second.png
     """
 
-    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RUN [RUN ...]")]
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional, ONE_OR_MORE_RUNS]
     """Folders of runs that `msdgs-train fit` has filled."""
-    data: Annotated[Path | None, tyro.conf.arg(metavar="DATA")] = None
-    """The dataset, if it has moved since training."""
+    data: Annotated[Path | None, optional("DATA")] = None
+    """The folder of the dataset, if it has moved since training."""
     split: Literal["test", "val", "train"] = "test"
     """The images to evaluate on."""
     sheet: Path = Path("side_by_side.png")

@@ -37,8 +37,8 @@ class Fit:
     """Train on a folder of images. RUN gets config.json, metrics.jsonl, curve.png, renders/, checkpoint.pt, model.pt
     (last step) and best.pt (highest PSNR on held-out images).
 
-    Ctrl-C saves a checkpoint and stops; --resume continues from it bit by bit, also with other --steps if that moves no
-    phase.
+    Ctrl-C saves a checkpoint and stops; --resume continues with the same bits, also with other --steps if that moves no
+    phase of the schedule.
 
     A first result in minutes:  msdgs-train fit data/scene runs/first --size 200 --steps 3000
 

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from msdgs_train.cli.console import console
+from msdgs_train.settings import optional
 
 
 @dataclass(frozen=True)
@@ -18,13 +19,13 @@ class Steps:
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """The model.pt or best.pt of a run."""
-    t: float | None = None
+    t: Annotated[float | None, optional("TIME")] = None
     """Time in the scene's range; 0.3 of the way through it if not given."""
     out: Path = Path("steps.png")
     """The PNG to write."""
     size: int = 400
     """Width of each image in pixels, height in proportion."""
-    camera: str | None = None
+    camera: Annotated[str | None, optional("NAME")] = None
     """Name of a camera in the model; the one whose image is nearest in time if not given."""
 
     def execute(self) -> int:

@@ -7,11 +7,12 @@ from typing import Annotated
 import tyro
 
 from msdgs_train.cli.console import console, frame_progress
+from msdgs_train.settings import optional
 
 
 @dataclass(frozen=True)
 class Synthetic:
-    """Make a small moving scene with known motion in D-NeRF layout, by ray marching: no download, a few seconds.
+    """Make a small moving scene with known motion in D-NeRF layout, by ray marching: no download.
 
     Example:  msdgs-train synthetic data/toy && msdgs-train fit data/toy runs/toy --steps 2000
     """
@@ -24,7 +25,7 @@ class Synthetic:
     """Training images of each camera, at evenly spaced times."""
     test_frames: int = 12
     """Held-out images, at intermediate times, from one smooth turn around the scene."""
-    cameras: int | None = None
+    cameras: Annotated[int | None, optional("INT")] = None
     """Fixed cameras that see each time together; one camera that is elsewhere at each time if not given."""
     seed: int = 0
     """Seed of the camera positions."""

@@ -24,7 +24,7 @@ class View:
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """The model.pt or best.pt of a run."""
     port: int = 8080
-    """The next free one if it is taken, any free one if 0."""
+    """Port to listen on; the next free one if it is taken, any free one if 0."""
     host: str = "127.0.0.1"
     """Address to listen on; 0.0.0.0 for all networks."""
 

@@ -6,10 +6,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.settings import optional
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
 EVALUATIONS = 10  # number of evaluations of held-out images during training
@@ -20,22 +21,22 @@ LOG_LINES = 100
 class Budget:
     """Settings that all systems share; None keeps the system's own."""
 
-    steps: int | None = 3000
+    steps: Annotated[int | None, optional("INT")] = 3000
     """Optimizer steps of each run, instead of the preset's. All schedules are fractions of a run and scale with it."""
-    minutes: float | None = None
+    minutes: Annotated[float | None, optional("MINUTES")] = None
     """Length of each run, counted as --time says, instead of --steps."""
-    size: int | None = None
-    """Width of all images in pixels."""
-    time_from: str | None = None
-    """Where the times of all images come from, as in `fit`."""
-    init_num_pts: int | None = None
+    size: Annotated[int | None, optional("PIXELS")] = None
+    """Width of all images in pixels, height in proportion; their own if not given."""
+    time_from: Annotated[str | None, optional("{names,index,none,REGEX}")] = None
+    """Times of all images, as in `msdgs-train fit --help`; the datasets' own if not given."""
+    init_num_pts: Annotated[int | None, optional("INT")] = None
     """Initial Gaussians of all systems; their own settings if not given."""
-    max_gaussians: int | None = None
+    max_gaussians: Annotated[int | None, optional("INT")] = None
     """Maximum Gaussians of all systems; their own settings if not given."""
     threads: int = 1
     """CPU threads of each run."""
     time: Literal["wall", "cpu"] = "wall"
-    """What --minutes count: time that passes, or CPU time of all threads of a run."""
+    """What --minutes counts: time that passes, or CPU time of all threads of a run."""
 
     def settings(self) -> dict[str, Any]:
         """Return the settings of `TrainConfig`."""
@@ -43,10 +44,8 @@ class Budget:
         if self.steps is not None:
             every = max(self.steps // EVALUATIONS, 1)
             given |= {"eval_every": every, "checkpoint_every": every, "log_every": max(self.steps // LOG_LINES, 1)}
-        optional = {
-            name: getattr(self, name) for name in ("steps", "size", "time_from", "init_num_pts", "max_gaussians")
-        }
-        return given | {name: value for name, value in optional.items() if value is not None}
+        shared = {name: getattr(self, name) for name in ("steps", "size", "time_from", "init_num_pts", "max_gaussians")}
+        return given | {name: value for name, value in shared.items() if value is not None}
 
 
 @dataclass(frozen=True)

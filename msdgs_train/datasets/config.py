@@ -1,10 +1,10 @@
 """Settings of the data."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from msdgs_train.datasets.common.times import EXPECTED, is_time_from
-from msdgs_train.settings import Checked
+from msdgs_train.settings import Checked, optional
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
@@ -13,12 +13,12 @@ BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 class DataConfig(Checked):
     """Images and background."""
 
-    size: int | None = None
+    size: Annotated[int | None, optional("PIXELS")] = None
     """Width of the images in pixels, height in proportion; their own if not given."""
     llffhold: int = 0
     """N: the first training image and every N-th after it are held out for testing, and those halfway between for
     validation, in place of the dataset's splits; if it names none, these are of all images. 0: the dataset's splits."""
-    time_from: str | None = None
+    time_from: Annotated[str | None, optional("{names,index,none,REGEX}")] = None
     """Times of the images: `names` takes the number, date or clock in the files' names that varies with time; `index`
     their order; `none` is a scene that stands still; a regular expression has the time as its group, such as
     'frame_(\\d+)'. The dataset's own times if not given, `names` for COLMAP."""
@@ -26,7 +26,7 @@ class DataConfig(Checked):
     """Whether pixels that a dataset's masks hide (black in the mask) are left out of the loss and of evaluations."""
     background: Literal["white", "black", "random"] = "white"
     """Color behind the scene; random: another one each step, white in evaluation."""
-    scene_half_size: float | None = None
+    scene_half_size: Annotated[float | None, optional("LENGTH")] = None
     """Half the side of the cube around its center that holds the scene, in the dataset's units; from points or cameras
     if not given."""
 

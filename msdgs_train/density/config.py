@@ -1,11 +1,11 @@
 """Settings of density control."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from torch import Tensor
 
-from msdgs_train.settings import Checked
+from msdgs_train.settings import Checked, optional
 
 GAUSSIANS_PER_PIXEL, FEWEST, MOST = 0.45, 18_000, 100_000
 """The upper bound of the number of Gaussians if none is given. A bound of 72,000 instead of 18,000 gains 0.1 to 0.5 dB
@@ -20,12 +20,12 @@ class DensityConfig(Checked):
     """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
     init_min_views: float = 0.0
     """Random Gaussians start where at least this fraction of the cameras sees them."""
-    max_gaussians: int | None = 10_000
-    """Upper bound of the number of Gaussians; those with the largest gradients are densified first. None: 0.45 per
-    pixel of a training image, but 18,000 to 100,000."""
+    max_gaussians: Annotated[int | None, optional("INT")] = 10_000
+    """Upper bound of the number of Gaussians; those with the largest gradients are densified first. If not
+    given: 0.45 per pixel of a training image, but 18,000 to 100,000."""
     density_strategy: Literal["gradient", "mcmc"] = "gradient"
     """gradient clones and splits by gradients of the projected means, and prunes; mcmc relocates low-opacity Gaussians
-    and grows by 5 % a round up to max_gaussians."""
+    and grows by 5 % a round up to --max-gaussians."""
     refine_start_fraction: float = 500 / 16_000
     """Density control begins after this fraction of the run."""
     refine_every_fraction: float = 100 / 16_000
@@ -49,12 +49,12 @@ class DensityConfig(Checked):
     0: never."""
     noise_lr: float = 5e5
     """mcmc: factor of the noise added to means, whose size follows from their learning rate and covariance."""
-    opacity_reg: float | None = None
+    opacity_reg: Annotated[float | None, optional("FLOAT")] = None
     """Weight of the mean opacity, which makes Gaussians that aren't needed transparent, so that they are removed; with
     gradient until density control ends, but with one image per time not while the time window grows, when it may take
     fast objects. 0.01 with mcmc and 0 with gradient if not given."""
-    scale_reg: float | None = None
-    """The same for the mean scale in scene units."""
+    scale_reg: Annotated[float | None, optional("FLOAT")] = None
+    """Weight of the mean scale in scene units, as --opacity-reg."""
 
     def __post_init__(self) -> None:
         self.require_counts("init_num_pts")

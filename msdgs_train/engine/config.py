@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -14,7 +14,7 @@ from msdgs_train.engine.curriculum_config import CurriculumConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.losses.config import LossConfig
-from msdgs_train.settings import Checked
+from msdgs_train.settings import Checked, optional
 
 SMALL_LAYER = MLPConfig(width=96, depth=2, xyz_frequencies=4, time_width=64)
 SMALL_MODEL = ModelConfig(sh_degree=2, layers=(SMALL_LAYER, SMALL_LAYER))
@@ -27,7 +27,7 @@ class RunConfig(Checked):
     system: tyro.conf.Suppress[str] = "msdgs-small"
     """The registered system that builds and trains the model."""
     steps: int = 16_000
-    """Optimizer steps; with `minutes`, steps of the schedule."""
+    """Optimizer steps; with --minutes, steps of the schedule."""
     batch_size: int = 1
     """Images per step, rendered in parallel; gradients are averaged over them."""
     seed: int = 0
@@ -38,11 +38,11 @@ class RunConfig(Checked):
     device: Literal["cpu", "cuda"] = "cpu"
     """cuda: the model is on the GPU and rendered by gsplat (msdgs[cuda]), while the loss and the kernels of nodes and
     planes stay on the CPU; the bits differ from run to run."""
-    minutes: float | None = None
-    """Length of the run, counted as `time` says, with evaluation and saving, without compiling kernels: schedules are
-    laid out over it, and the bits depend on the speed of the machine."""
+    minutes: Annotated[float | None, optional("MINUTES")] = None
+    """Length of the run instead of --steps: schedules are laid out over it. Evaluation and saving count, compiling
+    kernels doesn't. The same seed no longer gives the same bits."""
     time: Literal["wall", "cpu"] = "wall"
-    """What `minutes` and reports count: time that passes, or the CPU time of all threads, which other work on the
+    """What --minutes and reports count: time that passes, or the CPU time of all threads, which other work on the
     machine hardly changes."""
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class OptimizerConfig(Checked):
     sh_degree_fraction: float = 0.125
     """Fraction of the run after which the degree of the spherical harmonics in use rises by one; 0: all from the
     start."""
-    eps2d_init: float | None = None
+    eps2d_init: Annotated[float | None, optional("PX²")] = None
     """Dilation of projected covariances, px², until all times take part; the model's own eps2d if not given."""
     ema_fraction: float = 0.0
     """The model that is evaluated and saved is an exponential average over about this last fraction of the run, once
@@ -93,7 +93,7 @@ class LoggingConfig(Checked):
     log_every: int = 20
     """Steps between lines in metrics.jsonl."""
     eval_every: int = 1_000
-    """Steps between evaluations of held-out images; with `minutes` fewer, so that they take about 3 % of the time; 0:
+    """Steps between evaluations of held-out images; with --minutes fewer, so that they take about 3 % of the time; 0:
     only at the end."""
     checkpoint_every: int = 1_000
     """Steps between checkpoints; 0: only at the end."""
