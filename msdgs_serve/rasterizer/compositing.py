@@ -70,7 +70,6 @@ class Frame(NamedTuple):
     rgb: np.ndarray  # [H, W, 3] background included
     alpha: np.ndarray  # [H, W] 1 - transmittance
     depth: np.ndarray  # [H, W] mean distance along the camera axis, infinite if alpha is 0; [0, 0] if not drawn
-    median_depth: np.ndarray  # [H, W] depth at which transmittance falls to 1/2, or infinite; [0, 0] if not drawn
 
 
 def composite(
@@ -82,13 +81,12 @@ def composite(
     options: RasterizerOptions,
     *,
     depth: bool = False,
-    median_depth: bool = False,
 ) -> Frame:
-    """Blend the splats into an image. `median_depth` implies `depth`."""
+    """Blend the splats into an image."""
     dtype = splats.records.dtype
-    depths = (True, True) if median_depth else (True,) if depth else ()
-    mean, median = (np.empty((height, width) if len(depths) > k else (0, 0), dtype) for k in range(2))
-    frame = Frame(np.empty((height, width, 3), dtype), np.empty((height, width), dtype), mean, median)
+    shapes = ((height, width, 3), (height, width), (height, width) if depth else (0, 0))
+    frame = Frame(*(np.empty(shape, dtype) for shape in shapes))
+    depths = (True,) if depth else ()
     limits = pixel_limits(options, dtype)
     count = len(tiles.offsets) - 1
     for first in range(0, count, TILES_PER_ROUND):
@@ -110,17 +108,16 @@ def _composite_tiles(
 ) -> bool:
     """Draw tiles up to the tile `past`, `TILES_PER_TURN` at a time. Return whether all of them are drawn.
 
-    `depths` is () for no depth, (True,) for the mean, (True, True) for mean and median. Its length is known at compile
-    time, so that depths that are not drawn cost nothing. The mean makes a frame of 10,000 splats at 400 × 400 take 1.03
-    to 1.07 times as long.
+    `depths` is (True,) if depth is drawn, or (). Its length is known at compile time, so that depth costs nothing if it
+    isn't drawn. It makes a frame of 10,000 splats at 400 × 400 take 1.03 to 1.07 times as long.
     """
-    state = np.empty(6 * PIXELS, records.dtype)
+    state = np.empty(5 * PIXELS, records.dtype)
     batch = np.empty(RECORD * int(BATCH), records.dtype)
     grid = grid_of_a_tile(records)
     alive = np.empty(BLOCKS, np.bool_)
     touching = np.empty(BLOCKS, np.uint64)
     height, width = frame.alpha.shape
-    pixels = (frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1), frame.median_depth.reshape(-1))
+    pixels = (frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1))
     flat, last = records.reshape(-1), np.uint64(max(len(tiles.splat_ids), 1) - 1)
     while True:
         first = fetch_add(counters, TAKEN, TILES_PER_TURN)
@@ -216,16 +213,16 @@ def _blend_block(
         )
         alpha = alpha_of(exponent, limits)
         one, two = first_of(alpha), second_of(alpha)
-        sums = _blended(first_of(one), batch, places[0], limits, depths, state, offset, sums)
-        sums = _blended(second_of(one), batch, places[1], limits, depths, state, offset, sums)
-        sums = _blended(first_of(two), batch, places[2], limits, depths, state, offset, sums)
-        sums = _blended(second_of(two), batch, places[3], limits, depths, state, offset, sums)
+        sums = _blended(first_of(one), batch, places[0], limits, depths, sums)
+        sums = _blended(second_of(one), batch, places[1], limits, depths, sums)
+        sums = _blended(first_of(two), batch, places[2], limits, depths, sums)
+        sums = _blended(second_of(two), batch, places[3], limits, depths, sums)
         bits = _without_lowest(fourth)
         second, third, fourth = _without_three(bits)
     while bits != np.uint64(0):
         place = lowest_bit(bits)
         alpha = alpha_of(_exponent(batch, place, pixel_x, pixel_y), limits)
-        sums = _blended(alpha, batch, place, limits, depths, state, offset, sums)
+        sums = _blended(alpha, batch, place, limits, depths, sums)
         bits = _without_lowest(bits)
     open_, left, red, green, blue, depth = sums
     store(state, offset, select(open_, left, negative(left)))
@@ -271,8 +268,6 @@ def _blended(
     k: np.uint64,
     limits: PixelLimits,
     depths: tuple,
-    state: np.ndarray,
-    offset: np.uint64,
     sums: tuple,
 ) -> tuple[Mask, Vector, Vector, Vector, Vector, Vector]:
     """Blend one splat. Return the mask of unfinished pixels, and transmittance, color and depth behind it."""
@@ -280,8 +275,6 @@ def _blended(
     after = fma(-alpha, left, left)
     open_ = open_ & (after > limits.transmittance_min)
     weight = select(open_, alpha * left, filled(0, left))
-    if len(depths) > 1:
-        _keep_median(open_, left, after, batch[k + DEPTH * BATCH], state, offset)
     left = select(open_, after, left)
     red = fma(weight, spread(batch[k + RED * BATCH]), red)
     green = fma(weight, spread(batch[k + GREEN * BATCH]), green)
@@ -289,13 +282,3 @@ def _blended(
     if len(depths) > 0:
         depth = fma(weight, spread(batch[k + DEPTH * BATCH]), depth)
     return open_, left, red, green, blue, depth
-
-
-@kernel
-def _keep_median(
-    open_: Mask, before: Vector, after: Vector, depth: float, state: np.ndarray, offset: np.uint64
-) -> None:
-    """Store the depth in pixels whose transmittance falls to a half or less at this splat."""
-    place = offset + np.uint64(5 * PIXELS)
-    kept = load(state, place)
-    store(state, place, select(open_ & (before > 0.5) & (after <= 0.5), filled(depth, kept), kept))

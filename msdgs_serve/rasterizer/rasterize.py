@@ -27,7 +27,6 @@ class Rendering(NamedTuple):
     rgb: np.ndarray  # [H, W, 3] display-referred, background included
     alpha: np.ndarray  # [H, W] 1 - transmittance
     depth: np.ndarray  # [H, W] expected distance along the camera axis, infinite if alpha is 0; [0, 0] if not requested
-    median_depth: np.ndarray  # [H, W] depth at which transmittance falls to 1/2, or infinite; [0, 0] if not requested
     extra: np.ndarray  # [H, W, C] blended as colors are; divide by alpha for a mean
     counts: np.ndarray  # [H, W] Gaussians that contribute to each pixel; [0, 0] if not requested
 
@@ -39,15 +38,14 @@ def rasterize(
     *,
     background: npt.ArrayLike = (0.0, 0.0, 0.0),
     depth: bool = False,
-    median_depth: bool = False,
     extra: np.ndarray | None = None,
     counts: bool = False,
     options: RasterizerOptions = GSPLAT,
 ) -> Rendering:
     """Render the Gaussians (equations 1 and 2) over a background color.
 
-    Depths are in scene units; `median_depth` implies `depth`. `extra` [N, C] are any C numbers per Gaussian, blended
-    like colors without a background; three of them take as long as the colors. `counts` takes a pass of its own.
+    Depths are in scene units. `extra` [N, C] are any C numbers per Gaussian, blended like colors without a background;
+    three of them take as long as the colors. `counts` takes a pass of its own.
 
     Safe to call from several threads; the same input gives the same bytes, whatever the number of threads.
 
@@ -67,7 +65,7 @@ def rasterize(
         size = right - left, bottom - top
         part = splats if size == (camera.width, camera.height) else _cut(splats, left, top, right, bottom)
         tiles = bin_into_tiles(part, *size, MAX_PAIRS)
-        frame = composite(part, tiles, *size, background, options, depth=depth, median_depth=median_depth)
+        frame = composite(part, tiles, *size, background, options, depth=depth)
         counted = count_splats(part, tiles, *size, options).blended if counts else np.empty((0, 0), part.records.dtype)
         return Rendering(*frame, _drawn_extra(channels, part, tiles, size, options), counted)
 

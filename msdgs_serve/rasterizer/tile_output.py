@@ -13,28 +13,25 @@ from msdgs_serve.rasterizer.view import TILE
 
 @inlined_kernel
 def clear_tile(state: np.ndarray, depths: tuple) -> None:
-    """Set transmittance to 1, colors and depth sum to 0, and the median depth to infinity."""
+    """Set transmittance to 1, colors and the sum of depths to 0."""
     real = state.dtype.type
     for k in range(np.uint64(0), np.uint64(PIXELS), np.uint64(NUM_LANES)):
         store(state, k, spread(real(1)))
     for k in range(np.uint64(PIXELS), np.uint64((5 if len(depths) > 0 else 4) * PIXELS), np.uint64(NUM_LANES)):
         store(state, k, spread(real(0)))
-    if len(depths) > 1:
-        for k in range(np.uint64(5 * PIXELS), np.uint64(6 * PIXELS), np.uint64(NUM_LANES)):
-            store(state, k, spread(real(np.inf)))
 
 
 @inlined_kernel
 def prefetch_tile(width: int, x0: int, y0: int, rows: int, depths: tuple, pixels: tuple) -> None:
     """Prefetch the pixels that the tile is written to: rows of an image are a memory page apart."""
-    rgb, alphas, means, _ = pixels
+    rgb, alphas, depth = pixels
     for row in range(rows):
         start = (y0 + row) * width + x0
         for third in range(3):
             prefetch(rgb, 3 * start + third * TILE)
         prefetch(alphas, start)
         if len(depths) > 0:
-            prefetch(means, start)
+            prefetch(depth, start)
 
 
 @inlined_kernel
@@ -60,7 +57,7 @@ def write_tile(
     width: int, x0: int, y0: int, state: np.ndarray, background: np.ndarray, depths: tuple, pixels: tuple
 ) -> None:
     """Write a tile into `pixels`, the flattened images of a frame."""
-    rgb, alphas, means, medians = pixels
+    rgb, alphas, depth = pixels
     for block in range(np.uint64(BLOCKS)):
         red, green, blue, alpha = _finish_block(block, state, background)
         column, row = np.int64(block % np.uint64(BLOCK_SIDE)), np.int64(block // np.uint64(BLOCK_SIDE))
@@ -68,9 +65,7 @@ def write_tile(
         store_square_of_triples(rgb, 3 * start, 3 * width, red, green, blue)
         store_square(alphas, start, width, alpha)
         if len(depths) > 0:
-            store_square(means, start, width, _mean_depth(block, state, alpha))
-        if len(depths) > 1:
-            store_square(medians, start, width, load(state, block * np.uint64(NUM_LANES) + np.uint64(5 * PIXELS)))
+            store_square(depth, start, width, _mean_depth(block, state, alpha))
 
 
 @kernel
@@ -78,7 +73,7 @@ def write_cut_tile(
     width: int, x0: int, y0: int, size: tuple, state: np.ndarray, background: np.ndarray, depths: tuple, pixels: tuple
 ) -> None:
     """Write a tile that extends beyond the image, of which `size` columns and rows are inside."""
-    rgb, alphas, means, medians = pixels
+    rgb, alphas, depth = pixels
     columns, rows = size
     for block in range(np.uint64(BLOCKS)):
         offset = block * np.uint64(NUM_LANES)
@@ -96,6 +91,4 @@ def write_cut_tile(
             for channel in range(3):
                 rgb[3 * pixel + channel] = state[place + PIXELS * (1 + channel)]
             if len(depths) > 0:
-                means[pixel] = state[place + 4 * PIXELS]
-            if len(depths) > 1:
-                medians[pixel] = state[place + 5 * PIXELS]
+                depth[pixel] = state[place + 4 * PIXELS]

@@ -101,8 +101,7 @@ class _Rasterize(torch.autograd.Function):
         *arrays, rgb = map(to_array, ctx.saved_tensors)
         splats, tiles, alpha = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
-        unused = np.empty((0, 0), rgb.dtype)
-        frame = Frame(rgb, alpha, unused, unused)
+        frame = Frame(rgb, alpha, depth=np.empty((0, 0), rgb.dtype))
         sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
         grads = project_backward(Gaussians(*arrays), splats, sums, *ctx.view)
         ctx.info.means2d_grads = torch.from_numpy(grads.means2d)

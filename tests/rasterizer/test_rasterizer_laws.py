@@ -72,14 +72,10 @@ def test_scaling_scene_and_camera_changes_nothing(factor: float, dtype: type):
 def test_further_channels_change_no_other_channel(dtype: type):
     gaussians, camera = scene(22, dtype)
     plain = rasterize(gaussians, camera, background=BACKGROUND)
-    assert plain.depth.shape == plain.median_depth.shape == plain.counts.shape == (0, 0)
+    assert plain.depth.shape == plain.counts.shape == (0, 0)
     with_depth = draw(gaussians, camera, background=BACKGROUND)
-    assert with_depth.median_depth.shape == (0, 0)
-    with_median = rasterize(gaussians, camera, background=BACKGROUND, median_depth=True)
-    np.testing.assert_array_equal(with_median.depth, with_depth.depth)
-    for more in (with_depth, with_median):
-        np.testing.assert_array_equal(more.rgb, plain.rgb)
-        np.testing.assert_array_equal(more.alpha, plain.alpha)
+    np.testing.assert_array_equal(with_depth.rgb, plain.rgb)
+    np.testing.assert_array_equal(with_depth.alpha, plain.alpha)
 
 
 def rotated(gaussians: Gaussians, camera: Camera, rotation: np.ndarray) -> tuple[Gaussians, Camera]:
@@ -175,16 +171,15 @@ def test_crops_show_the_same_pixels(dtype: type):
 def test_an_image_drawn_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch, max_pairs: int, dtype: type):
     gaussians, camera = scene(21, dtype)
     extra = np.random.default_rng(0).uniform(size=(len(gaussians), 2)).astype(dtype)
-    all_channels = {"background": BACKGROUND, "extra": extra, "median_depth": True, "counts": True}
+    all_channels = {"background": BACKGROUND, "extra": extra, "counts": True}
     clear, whole = clear_pixels(gaussians, camera), draw(gaussians, camera, **all_channels)
     monkeypatch.setattr(sys.modules[rasterize.__module__], "MAX_PAIRS", max_pairs)
     parts = draw(gaussians, camera, **all_channels)
     assert_same(parts, whole, clear)
     assert_close(parts.extra[clear], whole.extra[clear], f"rgb.{np.dtype(dtype).name}")
     np.testing.assert_array_equal(parts.counts[clear], whole.counts[clear])
-    assert parts.median_depth.shape == whole.median_depth.shape
     assert [channel.shape for channel in draw(gaussians, camera)] == [
-        *(channel.shape for channel in whole[:3]), (0, 0), (*whole.alpha.shape, 0), (0, 0)
+        *(channel.shape for channel in whole[:3]), (*whole.alpha.shape, 0), (0, 0)
     ]  # fmt: skip
 
 
@@ -247,27 +242,3 @@ def test_extra_channels_that_cannot_be(bad: np.ndarray):
     gaussians, camera = scene(20, np.float32)
     with pytest.raises(InvalidInput, match="extra"):
         draw(gaussians, camera, extra=bad)
-
-
-@DTYPES
-def test_median_depth_is_where_half_of_the_light_is_gone(dtype: type):
-    """Against a loop over the Gaussians, front to back, at pixels that are not at a threshold."""
-    gaussians, camera = scene(20, dtype)
-    got = draw(gaussians, camera, background=BACKGROUND, median_depth=True)
-    plain = draw(gaussians, camera, background=BACKGROUND)
-    np.testing.assert_array_equal(got.rgb, plain.rgb)
-    want, margin = np.full(got.alpha.shape, np.inf), np.full(got.alpha.shape, np.inf)
-    axis = camera.world_to_camera[2]
-    depths = (gaussians.means.astype(float) @ axis[:3] + axis[3]).astype(dtype)
-    before = np.ones_like(got.alpha)
-    order = np.argsort(depths, kind="stable")
-    for count, i in enumerate(order, start=1):
-        after = 1 - draw(select(gaussians, order[:count]), camera).alpha
-        margin = np.minimum(margin, np.abs(after - 0.5))
-        want[(before > 0.5) & (after <= 0.5)] = depths[i]
-        before = after
-    clear = margin > 1e-4
-    assert np.isfinite(want[clear]).any()
-    np.testing.assert_array_equal(np.isfinite(got.median_depth[clear]), np.isfinite(want[clear]))
-    seen = clear & np.isfinite(want)
-    assert_close(got.median_depth[seen], want[seen], "projection.float32.relative")
