@@ -1,15 +1,17 @@
 """The options of `to_onnx.py` and `convert.py`, without importing torch, so that `--help` is printed at once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from msdgs_serve.scene.errors import InvalidInput
 
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Kept = Literal["heads", "modulation", "layers", "invisible", "static", "sh", "float32"]
+"""The rules of pruning, and float32."""
 
 
 @dataclass(frozen=True)
@@ -55,20 +57,9 @@ class ExportOptions:
     """No sweep and no report: the plan `network`, pruned."""
     data: Path | None = None
     """The folder of the dataset. Errors are measured from its training cameras, and held-out images compared."""
-    keep_invisible: Flag = False
-    """Keep Gaussians that never contribute to a frame."""
-    keep_static: Flag = False
-    """Keep Gaussians in the graph that never move visibly."""
-    keep_layers: Flag = False
-    """Keep layers whose weighted step is invisible."""
-    keep_heads: Flag = False
-    """Keep heads that change nothing."""
-    keep_modulation: Flag = False
-    """Keep modulation whose factors are 1."""
-    keep_sh: Flag = False
-    """Keep SH bands that change nothing."""
-    keep_float32: Flag = False
-    """Keep all arrays in float32 instead of fewer bits."""
+    keep: tuple[Kept, ...] = ()
+    """What to keep although it has no visible effect: `heads`, scale `modulation`, `layers`, `invisible` Gaussians, the
+    motion of `static` ones, upper `sh` bands. With `float32` arrays aren't stored in fewer bits."""
     tolerance: float = 1e-4
     """Largest relative error of poses that the plan `network` may have against the model's layers."""
     duration: float | None = None
@@ -95,10 +86,9 @@ class ExportOptions:
         return "network" if self.quick and self.plan is None else self.plan
 
     @property
-    def keep(self) -> frozenset[str]:
-        """Names of the pruning rules that are switched off."""
-        names = [field.name for field in fields(self) if field.name.startswith("keep_")]
-        return frozenset(name.removeprefix("keep_") for name in names if getattr(self, name))
+    def packs(self) -> bool:
+        """Whether arrays are stored in fewer bits."""
+        return "float32" not in self.keep
 
 
 @dataclass(frozen=True)

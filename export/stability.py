@@ -1,4 +1,4 @@
-"""`python export/stability.py model.pt`: the error of float32 and lower precision against float64."""
+"""`python export/stability.py model.pt`: the error of float32 against float64."""
 
 import sys
 from os.path import dirname, realpath
@@ -25,27 +25,25 @@ UNSTABLE = 3
 def main(
     model: Annotated[Path, tyro.conf.Positional],
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
-    plot: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
     times: int = 20,
     min_psnr: float = 50.0,
 ) -> int:
-    """Measure how stable a trained model's deformation is in float32 and in less.
+    """Measure how stable a trained model's deformation is in float32.
 
     A chain of layers multiplies round-off: each layer reads the means that the layers before it have moved. For
     Gaussians spread over the scene, also at times between the frames, this measures how much a small displacement
-    grows from layer to layer, and the errors of poses in float32, bfloat16 and float16 against float64. Then it renders
-    the worst times in each format. docs/stability.md explains the table.
+    grows from layer to layer, and the errors of poses in float32 against float64. Then it renders the worst times in
+    both. docs/stability.md explains the table.
 
     Type this:
 
-    python export/stability.py runs/ball/model.pt --plot stability.png
+    python export/stability.py runs/ball/model.pt
 
     The exit status is 0 if float32 is as good as float64, 3 if it isn't, and 2 if the file can't be read.
 
     Args:
         model: The `model.pt` of a training run.
         json: Write the numbers to this file.
-        plot: Draw growth, amplification and errors into this PNG.
         times: The number of times to compare at, both ends of the scene's time range among them.
         min_psnr: PSNR in dB of the worst frame against float64, below which an error counts as visible.
     """
@@ -56,10 +54,9 @@ def main(
         if not 0 < min_psnr < 100:
             raise InvalidInput("min_psnr", "between 0 and 100 dB", min_psnr)
         require_folder_of("json", json)
-        require_folder_of("plot", plot)
         with messages.status("loading torch and the kernels"):
             from export.precision.show import assess_and_show  # slow to import: not before --help
-        report = assess_and_show(model, times, min_psnr, json, plot, messages)
+        report = assess_and_show(model, times, min_psnr, json, messages)
         return 0 if report.stable else UNSTABLE
 
     return run(assessed, "stopped; nothing was written")

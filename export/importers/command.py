@@ -24,7 +24,7 @@ from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import scratch_folder
 
-FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep_float32", "duration", "up")
+FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep", "duration", "up")
 """The options that splats and sequences have; nothing is pruned or fitted."""
 
 POLYNOMIAL_TIMES = 9
@@ -62,9 +62,11 @@ def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path |
         for field in fields(options):
             if field.name not in FOR_SPLATS and getattr(options, field.name) != field.default:
                 raise InvalidInput(field.name, "left out: it is for trained models", str(getattr(options, field.name)))
-        if options.keep_float32 and options.min_psnr is not None:
-            raise InvalidInput("min_psnr", "left out with --keep-float32", options.min_psnr)
-        min_psnr = None if options.keep_float32 else MIN_PSNR if options.min_psnr is None else options.min_psnr
+        if pruning := " ".join(part for part in options.keep if part != "float32"):
+            raise InvalidInput("keep", "left out, or float32: nothing of a splat is pruned", pruning)
+        if not options.packs and options.min_psnr is not None:
+            raise InvalidInput("min_psnr", "left out with --keep float32", options.min_psnr)
+        min_psnr = None if not options.packs else MIN_PSNR if options.min_psnr is None else options.min_psnr
         imported = Import(path, file_format, output, min_psnr, None if options.up is None else _up(options.up))
         write = _splats if file_format in READERS else _sequence
         _print(write(imported, console), output, console)

@@ -29,9 +29,6 @@ from msdgs_train.gaussians.model_file import load_model
 if TYPE_CHECKING:
     from export.measure.images import HeldOutImages
 
-STORAGE = "float32"
-"""The rule of storage, as `ExportOptions.keep_float32` switches it off."""
-
 WIDE = 180
 """Width of the terminal, in characters, from which the table has all columns."""
 
@@ -45,16 +42,16 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
     with scratch_folder() as folder, tracked(console) as track:
         images = _held_out_images(model, options.data, track)
         rules = [rule for rule in RULES if rule not in options.keep]
-        packs, result = STORAGE not in options.keep, None
+        result = None
         limits = {"min_psnr": options.min_psnr, "max_bytes": options.max_mb and round(1e6 * options.max_mb)}
-        job = ExportJob(model, folder, **limits, rules=rules, packs=packs, images=images, progress=track)
+        job = ExportJob(model, folder, **limits, rules=rules, packs=options.packs, images=images, progress=track)
         if options.chosen_plan is None:
             result = Sweep(job).run()
             chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
         else:
             planned = _planned if job.max_bytes is None else _planned_within_bytes
             chosen, error = planned(job, options.chosen_plan)
-        if packs and job.max_bytes is None:
+        if options.packs and job.max_bytes is None:
             chosen, error = stored(job, chosen, error, job.min_psnr)
         exported = write_scene(
             options.scene_file,

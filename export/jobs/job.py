@@ -159,7 +159,7 @@ class ExportJob:
     def network(self) -> Candidate | None:
         """The whole network in float32, which takes 0.6 of torch's time; None if its round-off is near `min_psnr`."""
         report, limit = self.stability, self.min_psnr + ROUND_OFF_DB
-        exact_enough = report.stable and all(gap.psnr >= limit for gap in report.formats)
+        exact_enough = report.stable and (report.float32 is None or report.float32.psnr >= limit)
         return self.candidate(BASELINE, None) if exact_enough else None
 
     def pruned(self, pruning_db: float | None) -> PrunedModel:

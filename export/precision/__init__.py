@@ -1,1 +1,1 @@
-"""Number formats for a model's deformation, and the report on its stability in them."""
+"""The report on the stability of a model's deformation in float32."""

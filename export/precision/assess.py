@@ -3,8 +3,9 @@
 It is measured in frames, and predicted from the amplification of errors by the layers.
 """
 
+import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,8 +16,7 @@ from export.measure.amplification import Growth, growth
 from export.measure.frames import NEAR, FrameDifference, PoseRenderer, compare
 from export.measure.poses import half_diagonal, largest_error, pose_errors, posed, usable_rows
 from export.measure.times import times_to_verify
-from export.precision.formats import FLOAT32, Format, in_format
-from export.precision.report import FormatGap, Samples, StabilityReport, WorstGaussians, limits_met
+from export.precision.report import Float32Gap, Samples, StabilityReport, WorstGaussians, limits_met
 from export.progress import Track, no_progress
 from export.target import MIN_PSNR
 from msdgs_serve.scene.camera import Camera
@@ -47,11 +47,11 @@ class _TimeSample(NamedTuple):
     growth: Growth
     exact: Gaussians  # float64
     single_means: np.ndarray
-    errors: dict[str, np.ndarray]  # [M] the largest of each Gaussian, by format
+    errors: np.ndarray  # [M] the largest of each Gaussian
 
 
 class _FrameGap(NamedTuple):
-    """The worst frame of a format at one time."""
+    """The worst frame in float32 at one time."""
 
     difference: FrameDifference
     without_worst: float  # dB
@@ -65,26 +65,22 @@ def assess(
     *,
     min_psnr: float = MIN_PSNR,
     times: int = TIMES,
-    formats: Sequence[Format] = (FLOAT32,),
     track: Track = no_progress,
 ) -> StabilityReport:
-    """Compare the model in float32, and in `formats`, with itself in float64: poses at `times` times, frames at the
-    worst of them. Errors under `min_psnr`, in dB, count as visible. The model isn't changed."""
+    """Compare the model in float32 with itself in float64: poses at `times` times, frames at the worst of them. Errors
+    under `min_psnr`, in dB, count as visible. The model isn't changed."""
     if not len(model.deformation) or not len(model.gaussians):
         broken = _hidden(PoseRenderer(scene), model) if len(model.gaussians) else []
         return StabilityReport(len(model.gaussians), times, min_psnr, limits_met(model, []), broken)
     with np.errstate(over="ignore", invalid="ignore"):  # overflow is part of the report
-        return _Assessment(model, scene, min_psnr, formats).run(times, track)
+        return _Assessment(model, scene, min_psnr).run(times, track)
 
 
 class _Assessment:
-    def __init__(self, model: DynamicGaussians, scene: SceneInfo, min_psnr: float, formats: Sequence[Format]) -> None:
+    def __init__(self, model: DynamicGaussians, scene: SceneInfo, min_psnr: float) -> None:
         self.model, self.scene, self.min_psnr = model, scene, min_psnr
         self.size, self.count = half_diagonal(scene.bounds), len(model.gaussians)
-        self.formats = (FLOAT32, *(f for f in formats if f is not FLOAT32))
-        self.models = {f.name: in_format(model, f) for f in self.formats}
-        self.single = self.models[FLOAT32.name]
-        self.double = in_format(model, Format("float64", torch.float64, torch.float64, "nowhere", "the reference"))
+        self.single, self.double = copy.deepcopy(model).float(), copy.deepcopy(model).double()
         self.mean_factors = _mean_factors(self.double)
         self.renderer = PoseRenderer(scene, model.rasterizer)
 
@@ -95,10 +91,10 @@ class _Assessment:
             found.append(self._sample(t, np.arange(i % stride, self.count, stride)))
             on_time()
         samples = _joined(found)
-        by_error = sorted(found, key=lambda m: np.quantile(m.errors[FLOAT32.name], NEAR_WORST, method="higher"))
+        by_error = sorted(found, key=lambda m: np.quantile(m.errors, NEAR_WORST, method="higher"))
         on_step = track("poses and frames in float32 and float64", 0)
         frames = [self._frames(sample, samples, on_step) for sample in by_error[::-1][:FRAME_TIMES]]
-        gaps = [_format_gap(f, found, [gaps[f.name] for gaps, _, _ in frames]) for f in self.formats]
+        gap = _float32_gap(found, [frame_gap for frame_gap, _, _ in frames])
         predicted = min(prediction for _, prediction, _ in frames)
         overflowed = sum(int((~usable_rows(sample.exact)).sum()) for sample in found)
         broken = [f"{overflowed:,} poses are NaN or infinite even in float64"] if overflowed else []
@@ -111,23 +107,22 @@ class _Assessment:
             worst_amplification=float(samples.amplification.max()),
             layer_growth=[[_quantile(a, q) for q in (0.5, NEAR_WORST, 1.0)] for a in samples.after],
             predicted_psnr=predicted,
-            formats=gaps,
+            float32=gap,
             worst=frames[0][2],
             limits=limits_met(self.double, [sample.exact.scales for sample in found]),
             broken=broken + _hidden(self.renderer, self.double),
-            unstable=self._unstable(gaps[0], predicted),
+            unstable=self._unstable(gap, predicted),
             samples=samples,
         )
 
     def _sample(self, t: float, ids: np.ndarray) -> _TimeSample:
-        exact = posed(self.double, t, ids)
-        poses = {name: posed(model, t, ids) for name, model in self.models.items()}
-        errors = {name: largest_error(pose_errors(pose, exact, self.size)) for name, pose in poses.items()}
+        exact, single = posed(self.double, t, ids), posed(self.single, t, ids)
+        errors = largest_error(pose_errors(single, exact, self.size))
         found = growth(self.double, self.single, torch.from_numpy(ids), float(np.float32(t)))
         found = found._replace(predicted=found.predicted * self.mean_factors[ids])
-        return _TimeSample(t, ids, found, exact, poses[FLOAT32.name].means, errors)
+        return _TimeSample(t, ids, found, exact, single.means, errors)
 
-    def _unstable(self, gap: FormatGap, predicted: float) -> list[str]:
+    def _unstable(self, gap: Float32Gap, predicted: float) -> list[str]:
         if gap.overflowed:
             return [f"{gap.overflowed:,} Gaussians overflow in float32"]
         if gap.psnr < self.min_psnr:
@@ -139,20 +134,19 @@ class _Assessment:
 
     def _frames(
         self, sample: _TimeSample, joined: Samples, on_step: Callable[[], object]
-    ) -> tuple[dict[str, _FrameGap], float, WorstGaussians]:
-        """Frames at one time: gaps by format, PSNR of the predicted displacement, the worst Gaussians of float32."""
+    ) -> tuple[_FrameGap, float, WorstGaussians]:
+        """Frames at one time: the gap of float32, PSNR of the predicted displacement, the worst Gaussians."""
         exact, draw = posed(self.double, sample.t, on_block=on_step), self.renderer.draw
-        poses = {name: posed(model, sample.t, on_block=on_step) for name, model in self.models.items()}
-        single = poses[FLOAT32.name]
+        single = posed(self.single, sample.t, on_block=on_step)
         gaps = [np.square(self.renderer.pixel_gaps(single, exact, c)).sum() for c in self.renderer.cameras]
         cameras = [self.renderer.cameras[i] for i in np.argsort(gaps, kind="stable")[::-1][:FRAME_CAMERAS]]
         frames = [(camera, draw(exact, camera)) for camera in cameras]
         on_step()
-        by_format = {name: self._frame_gap(pose, exact, frames) for name, pose in poses.items()}
+        frame_gap = self._frame_gap(single, exact, frames)
         on_step()
         displaced = replace(exact, means=_displaced(exact.means, sample, joined))
         predicted = min(compare(draw(displaced, camera), frame).psnr for camera, frame in frames)
-        return by_format, predicted, self._worst(sample.t, single, exact, frames)
+        return frame_gap, predicted, self._worst(sample.t, single, exact, frames)
 
     def _frame_gap(self, got: Gaussians, exact: Gaussians, frames: _Frames) -> _FrameGap:
         without_worst = Gaussians(*(array.copy() for array in vars(got).values()))
@@ -185,12 +179,10 @@ class _Assessment:
         )
 
 
-def _format_gap(number_format: Format, samples: list[_TimeSample], frames: list[_FrameGap]) -> FormatGap:
-    errors = np.concatenate([sample.errors[number_format.name] for sample in samples])
+def _float32_gap(samples: list[_TimeSample], frames: list[_FrameGap]) -> Float32Gap:
+    errors = np.concatenate([sample.errors for sample in samples])
     worst = min(frames, key=lambda frame: frame.difference.psnr)
-    return FormatGap(
-        name=number_format.name,
-        meaning=number_format.meaning,
+    return Float32Gap(
         median=_quantile(errors, 0.5),
         near_worst=_quantile(errors, NEAR_WORST),
         worst=float(errors.max()),

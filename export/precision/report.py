@@ -23,11 +23,9 @@ class PlanUnsafe(MsdgsError):
 
 
 @dataclass(frozen=True)
-class FormatGap:
-    """Errors of poses and frames in one number format, against float64."""
+class Float32Gap:
+    """Errors of poses and frames in float32 against float64."""
 
-    name: str
-    meaning: str
     median: float  # of the largest relative error of each Gaussian, `export.measure.poses`
     near_worst: float  # the 99.9th percentile
     worst: float
@@ -76,7 +74,7 @@ class StabilityReport:
     worst_amplification: float = 1.0
     layer_growth: list[list[float]] = field(default_factory=list)  # per layer: median, 99.9 % and max of ‖J_k … J_1‖
     predicted_psnr: float = 100.0  # dB, worst frame, means displaced as the amplification predicts
-    formats: list[FormatGap] = field(default_factory=list)
+    float32: Float32Gap | None = None
     worst: WorstGaussians | None = None
     unstable: list[str] = field(default_factory=list)  # why layers can't be run in float32
     samples: Samples = field(default_factory=Samples, repr=False)

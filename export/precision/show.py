@@ -1,51 +1,42 @@
-"""A stability report as text in the terminal, as JSON and as a figure."""
+"""A stability report as text in the terminal and as JSON."""
 
 import json
 from pathlib import Path
 
-import numpy as np
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Column, Table
 
-from export.measure.amplification import UNIT_ROUNDOFF
 from export.precision.assess import assess
-from export.precision.formats import FORMATS
-from export.precision.report import StabilityReport, WorstGaussians
+from export.precision.report import Float32Gap, StabilityReport, WorstGaussians
 from export.progress import tracked
-from msdgs_serve.writing import replacing, write_text
+from msdgs_serve.writing import write_text
 from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model_file import load_model
 
-MAX_DRAWN = 1e30
 QUANTILES = ("median", "99.9 %", "largest")
 
 
 def assess_and_show(
-    model: Path, times: int, min_psnr: float, json_file: Path | None, plot: Path | None, messages: Console
+    model: Path, times: int, min_psnr: float, json_file: Path | None, messages: Console
 ) -> StabilityReport:
-    """Assess a model.pt in all formats, print the report, and write the files that are asked for."""
+    """Assess a model.pt, print the report, and write it as JSON if a file is given."""
     loaded = load_model(model)
     with tracked(messages) as track:
-        report = assess(loaded.model, loaded.scene, min_psnr=min_psnr, times=times, formats=FORMATS, track=track)
+        report = assess(loaded.model, loaded.scene, min_psnr=min_psnr, times=times, track=track)
     print_report(report, Console(soft_wrap=True, highlight=False))
     if json_file is not None:
         write_text(json_file, json.dumps(report.to_plain(), indent=2, allow_nan=False) + "\n")
-    if plot is not None:
-        draw(report, plot)
     return report
 
 
 def print_report(report: StabilityReport, console: Console) -> None:
-    """Print growth through the layers, the formats, the worst Gaussians and the verdict."""
+    """Print growth through the layers, the errors, the worst Gaussians and the verdict."""
     console.print(f"{report.gaussians:,} Gaussians, {len(report.layers)} layers, {report.times} times")
-    if report.layer_growth:
+    if report.float32 is not None:
         growth = Table("growth of a small displacement, after layer", *QUANTILES, box=None)
         for k, (kind, row) in enumerate(zip(report.layers, report.layer_growth, strict=True), start=1):
             growth.add_row(f"{k} ({kind})", *(f"× {value:,.1f}" for value in row))
-        console.print(growth, _format_table(report), sep="\n")
-        for gap in report.formats:
-            console.print(f"{gap.name}: {gap.meaning}", style="dim", markup=False)
+        console.print(growth, _error_table(report.float32, report), sep="\n")
         console.print(
             "median to largest: relative error of a pose. dB, value: the worst frame, and its worst pixel. Without "
             f"worst: with the worst 0.1 % of the Gaussians in float64. Red: under {report.min_psnr:g} dB",
@@ -58,13 +49,12 @@ def print_report(report: StabilityReport, console: Console) -> None:
     console.print(report.verdict, style="bold green" if report.stable else "bold red", markup=False)
 
 
-def _format_table(report: StabilityReport) -> Table:
+def _error_table(gap: Float32Gap, report: StabilityReport) -> Table:
     columns = (*QUANTILES, "pixels", "dB", "without worst", "value")
     table = Table(Column("against float64", no_wrap=True), *columns, box=None)
-    for gap in report.formats:
-        errors = (f"{value:.1e}" for value in (gap.median, gap.near_worst, gap.worst, gap.pixels))
-        frames = (_decibels(gap.psnr), _decibels(gap.psnr_without_worst), f"{gap.worst_pixel:.1e}")
-        table.add_row(gap.name, *errors, *frames, style="" if gap.psnr >= report.min_psnr else "red")
+    errors = (f"{value:.1e}" for value in (gap.median, gap.near_worst, gap.worst, gap.pixels))
+    frames = (_decibels(gap.psnr), _decibels(gap.psnr_without_worst), f"{gap.worst_pixel:.1e}")
+    table.add_row("float32", *errors, *frames, style="" if gap.psnr >= report.min_psnr else "red")
     table.add_row("predicted", *[""] * 4, _decibels(report.predicted_psnr))
     return table
 
@@ -82,31 +72,3 @@ def _worst_sentence(worst: WorstGaussians) -> str:
 
 def _decibels(psnr: float) -> str:
     return f"{psnr:.1f}" if psnr < MAX_PSNR else f"≥ {MAX_PSNR:g}"
-
-
-def draw(report: StabilityReport, path: Path) -> None:
-    """Write a PNG: growth of a displacement by layer, a histogram of its amplification, and the errors over it."""
-    figure = Figure(figsize=(15, 4.6), layout="constrained")
-    layers, histogram, errors = figure.subplots(1, 3)
-    samples, steps = report.samples, np.arange(len(report.layer_growth) + 1)
-    growth = np.nan_to_num([[1.0] * 3, *report.layer_growth], nan=MAX_DRAWN, posinf=MAX_DRAWN)
-    for label, values in zip(QUANTILES, growth.T, strict=True):
-        layers.semilogy(steps, values, marker="o", label=label)
-    layers.set(xlabel="after layer", ylabel="growth of a small displacement", xticks=steps[:: max(1, len(steps) // 12)])
-    layers.legend()
-    amplification = np.clip(samples.amplification, 1, MAX_DRAWN)
-    top = max(float(amplification.max(initial=1)), 10.0)
-    histogram.hist(amplification, bins=np.geomspace(1, top, 40).tolist(), log=True)
-    histogram.set(xscale="log", xlabel="amplification, largest product of Jacobians", ylabel="Gaussians × times")
-    shown = np.isfinite(samples.distance) & (samples.distance > 0) & (amplification < MAX_DRAWN)
-    errors.loglog(amplification[shown], samples.distance[shown], ".", markersize=2, alpha=0.3, label="measured")
-    shown &= np.isfinite(samples.predicted) & (samples.predicted < MAX_DRAWN)
-    errors.loglog(amplification[shown], samples.predicted[shown], ".", markersize=2, alpha=0.15, label="predicted")
-    ends = np.array([1.0, top])
-    errors.loglog(ends, UNIT_ROUNDOFF * ends, color="black", label="amplification × 2⁻²⁴")
-    errors.set(xlabel="amplification", ylabel="float32 against float64, scene units")
-    errors.legend(markerscale=3)
-    for axis in (layers, histogram, errors):
-        axis.grid(alpha=0.3)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")

@@ -96,7 +96,7 @@ RULES = {
     "static": Rule("motion of Gaussians that never move visibly", 0.9, static, lambda mask: int(mask.moves.sum())),
     "sh": Rule("SH bands that change nothing", 1.0, sh, lambda mask: mask.sh_degree),
 }
-"""By name, in the order in which they are applied. `ExportOptions.keep_NAME` switches one off."""
+"""By name, in the order in which they are applied. `ExportOptions.keep` switches them off."""
 
 
 def _if_allowed(statistics: PruningStatistics, mask: PruningMask, min_db: float, **changes: object) -> PruningMask:

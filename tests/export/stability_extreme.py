@@ -1,5 +1,6 @@
 """Extreme models and scenes: known traps of number formats, a million Gaussians, sizes, scales, opacities, NaN."""
 
+import copy
 import itertools
 import math
 import tempfile
@@ -14,9 +15,8 @@ import onnx
 import torch
 
 from export.bake import bake
-from export.measure.poses import half_diagonal, largest_error, pose_errors, posed
+from export.measure.poses import half_diagonal, in_float64, largest_error, pose_errors, posed
 from export.plans.registry import build
-from export.precision.formats import FLOAT32, in_format
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
@@ -48,10 +48,10 @@ def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: Defor
     """Return the largest error of the file's poses against the model in float64, at both ends and between, as
     `export.jobs.verify` measures it."""
     session = session or exported(model, scene)
-    double, worst = in_format(model, FLOAT32).double(), 0.0
+    exact, worst = in_float64(model), 0.0
     for t in (scene.time_range[0], sum(scene.time_range) / 2, scene.time_range[1]):
         drawn = session.gaussians(t).validate()
-        errors = pose_errors(drawn, posed(double, t), half_diagonal(scene.bounds))
+        errors = pose_errors(drawn, exact(t), half_diagonal(scene.bounds))
         worst = max(worst, float(largest_error(errors).max(initial=0)))
     return worst
 
@@ -103,7 +103,7 @@ def _network(model: DynamicGaussians) -> bytes:
 
 def _scale_error(scale: float) -> float:
     model = changed(lambda m: m.gaussians.log_scales.fill_(math.log(scale)), layers=())
-    return relative(exported(model).scene.static_scales, posed(in_format(model, FLOAT32).double(), 0.0).scales)
+    return relative(exported(model).scene.static_scales, in_float64(model)(0.0).scales)
 
 
 def a_million() -> Iterator[Row]:
@@ -116,7 +116,7 @@ def a_million() -> Iterator[Row]:
         means, quats, scales = DeformationSession(path).pose(0.5)
     ids = np.arange(0, len(means), 997)
     got = Gaussians(means[ids], quats[ids], scales[ids], np.ones(len(ids)), np.zeros((len(ids), 1, 3)))
-    errors = pose_errors(got, posed(in_format(model, FLOAT32).double(), 0.5, ids), half_diagonal(SCENE.bounds))
+    errors = pose_errors(got, posed(copy.deepcopy(model).double(), 0.5, ids), half_diagonal(SCENE.bounds))
     yield measured(f"N = {len(means):,}", MOVES, float(largest_error(errors).max()), "export.relative")
 
 

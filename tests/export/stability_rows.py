@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from export.measure.frames import PoseRenderer, compare, in_frame, project
-from export.measure.poses import posed
-from export.precision.formats import FLOAT32, in_format
+from export.measure.poses import in_float64
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -80,10 +79,10 @@ def worst_frame(
 ) -> tuple[int, float]:  # fmt: skip
     """Return the most Gaussians in a frame and the worst PSNR against the model in float64, of poses at some times seen
     by the first cameras of the scene, or by all."""
-    view, double = PoseRenderer(scene), in_format(model, FLOAT32).double()
+    view, exact_pose = PoseRenderer(scene), in_float64(model)
     seen, worst = 0, math.inf
     for t in times:
-        got, exact = pose(t), posed(double, t)
+        got, exact = pose(t), exact_pose(t)
         for camera in view.cameras[:cameras]:
             seen = max(seen, int(in_frame(*project(exact.means, camera), camera).sum()))
             worst = min(worst, compare(view.draw(got, camera), view.draw(exact, camera)).psnr)

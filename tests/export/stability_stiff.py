@@ -1,5 +1,6 @@
 """Constructed models whose layers amplify round-off: a little, a lot, and beyond the range of floats."""
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -11,7 +12,6 @@ import torch
 from export.measure.amplification import through_layers
 from export.measure.poses import posed
 from export.precision.assess import assess
-from export.precision.formats import FLOAT32, in_format
 from export.precision.report import StabilityReport
 from msdgs_train.gaussians.model import DynamicGaussians
 from tests.export.stability_rows import Change, Row, changed, measured, refused, worst_frame
@@ -152,7 +152,7 @@ def jacobian_rows() -> Iterator[Row]:
     for layer in (replace(MLP, xyz_frequencies=4), PLANE):
         model = changed(layers=(layer,) * 3).double()
         means = model.gaussians.means.detach()
-        single = in_format(model, FLOAT32).deformation
+        single = copy.deepcopy(model.deformation).float()
         found = through_layers(model.deformation, single, means, 0.3, all_deltas=False)
         step, columns, t = 1e-7, [], torch.tensor(0.3, dtype=torch.double)
         with torch.no_grad():

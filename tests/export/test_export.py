@@ -132,7 +132,7 @@ def test_the_seconds_of_a_scene_are_stored_if_they_are_given(tmp_path: Path, of:
     if of == "splats":
         file.write_bytes(ply_bytes(inria_columns(some_gaussians(20))))
     model = saved(tmp_path, random_model(5, layers=())) if of == "model" else file
-    options = ExportOptions(model, tmp_path / "scene.onnx", quick=of == "model", duration=2.5, keep_float32=True)
+    options = ExportOptions(model, tmp_path / "scene.onnx", quick=of == "model", duration=2.5, keep=("float32",))
     assert to_onnx(options) == 0
     assert DeformationSession(tmp_path / "scene.onnx").scene.metadata.duration == 2.5
     assert to_onnx(replace(options, duration=0)) == EXIT_INVALID

@@ -39,7 +39,7 @@ def double_ply(g: Gaussians, place: Similarity) -> bytes:
 
 
 def imported(path: Path, out: Path) -> DeformationSession:
-    assert to_onnx(ExportOptions(path, out, keep_float32=True)) == 0
+    assert to_onnx(ExportOptions(path, out, keep=("float32",))) == 0
     return DeformationSession(out)
 
 

@@ -292,11 +292,11 @@ def write_frames(folder: Path, frames: list[Gaussians]) -> Path:
 
 def scene_of(folder: Path, file_format: str = "sequence") -> DeformationSession:
     output = folder.parent / "scene.onnx"
-    with model_or_import(ExportOptions(folder, output, file_format, keep_float32=True), Console(quiet=True)):
+    with model_or_import(ExportOptions(folder, output, file_format, keep=("float32",)), Console(quiet=True)):
         return DeformationSession(output)
 
 
-@pytest.mark.parametrize("option", [{"max_mb": 5.0}, {"plan": "network"}, {"quick": True}, {"keep_static": True}])
+@pytest.mark.parametrize("option", [{"max_mb": 5.0}, {"plan": "network"}, {"quick": True}, {"keep": ("static",)}])
 def test_options_of_trained_models_are_refused_for_splats(tmp_path: Path, option: dict[str, Any]):
     splats = write(tmp_path, "a.ply", ply_bytes(inria_columns(some_gaussians(20, 0))))
     (name,) = option

@@ -78,7 +78,7 @@ def frames(folder: Path, g: Gaussians) -> list[Path]:
 
 
 def read_frames(folder: Path, files: list[Path]) -> Gaussians:
-    with model_or_import(ExportOptions(folder, folder / "scene.onnx", "sequence", keep_float32=True), QUIET):
+    with model_or_import(ExportOptions(folder, folder / "scene.onnx", "sequence", keep=("float32",)), QUIET):
         return DeformationSession(folder / "scene.onnx").gaussians(0.5)
 
 

@@ -60,7 +60,7 @@ def test_the_scene_follows_the_published_equations(tmp_path: Path, t: float):
 
 @pytest.mark.slow
 def test_the_imported_file_is_compared_with_the_equations_and_can_be_converted(tmp_path: Path):
-    options = ExportOptions(write(tmp_path, columns()), tmp_path / "a.onnx", duration=2.0, keep_float32=True)
+    options = ExportOptions(write(tmp_path, columns()), tmp_path / "a.onnx", duration=2.0, keep=("float32",))
     with model_or_import(options, QUIET):
         pass
     metadata = DeformationSession(tmp_path / "a.onnx").scene.metadata

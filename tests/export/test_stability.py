@@ -10,9 +10,8 @@ import pytest
 import torch
 
 from export.measure.frames import PoseRenderer, compare
-from export.measure.poses import posed
+from export.measure.poses import in_float64
 from export.precision.assess import assess
-from export.precision.formats import FLOAT32, FORMATS, in_format
 from export.precision.report import PlanUnsafe
 from export.stability import UNSTABLE, main
 from msdgs_serve.process import EXIT_INVALID
@@ -20,7 +19,7 @@ from tests.export import stability_extreme, stability_rows, stability_stiff
 from tests.export.stability_rows import FAILS, Row
 from tests.export.stability_suite import TABLE
 from tests.support.models import NODES, SCENE, export_scene, random_model, saved
-from tests.support.tolerances import assert_close, tolerance
+from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
 
@@ -44,47 +43,10 @@ def test_products_of_jacobians_are_those_of_differences():
     assert_none_fails([*stability_stiff.jacobian_rows()])
 
 
-@pytest.mark.parametrize("kind", ["mlp", "plane"])
-def test_formats_are_ordered_as_their_digits(kind: str):
-    model = random_model(40, layers=(kind, kind))
-    gaps = {gap.name: gap.near_worst for gap in assess(model, SCENE, times=3, formats=FORMATS).formats}
-    assert gaps["float64 encoding"] <= gaps["float32"] < gaps["float16"] < gaps["bfloat16"]
-    assert gaps["float16"] <= gaps["float16 throughout"]
-
-
-def test_bfloat16_rounds_what_a_product_reads_and_makes():
-    model = random_model(10, layers=("mlp",))
-    number_format = next(f for f in FORMATS if f.name == "bfloat16")
-    posed, layer = in_format(model, number_format).pose(0.4), model.deformation.layers[0]
-
-    def rounded(x: torch.Tensor) -> torch.Tensor:
-        return x.bfloat16().float()
-
-    def product(name: str, x: torch.Tensor) -> torch.Tensor:
-        weight, bias = (rounded(layer.get_parameter(f"{name}.{part}")) for part in ("weight", "bias"))
-        return rounded(torch.addmm(bias, rounded(x), weight.T))
-
-    def encoded(x: torch.Tensor, frequencies: int) -> torch.Tensor:
-        phases = torch.cat([x * 2.0**k for k in range(frequencies)], dim=1)
-        return torch.cat([x, phases.sin(), phases.cos()], dim=1)
-
-    with torch.no_grad():
-        time = product("time_output", product("time_hidden", encoded(torch.full((1, 1), 0.4), 6)).relu())
-        weight, bias = (rounded(layer.get_parameter(f"first.{part}")) for part in ("weight", "bias"))
-        xyz = 63
-        at_time = rounded(torch.addmv(bias, weight[:, xyz:], time[0]))
-        hidden = rounded(torch.addmm(at_time, rounded(encoded(model.gaussians.means, 10)), weight[:, :xyz].T)).relu()
-        for name in ("trunk.0", "trunk.1"):
-            hidden = product(name, hidden).relu()
-        heads = product("heads", hidden)
-        want = model.gaussians.means + heads[:, -1:].sigmoid() * heads[:, :3]
-    assert_close(posed.means.detach(), want, "float32.relative")
-
-
 def test_the_model_is_not_changed():
     model = random_model(20)
     before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-    assess(model, SCENE, times=2, formats=FORMATS[:2])
+    assess(model, SCENE, times=2)
     assert all(torch.equal(tensor, before[name]) for name, tensor in model.state_dict().items())
 
 
@@ -104,9 +66,9 @@ def test_the_worst_gaussians_are_named_with_what_they_do_to_the_image():
     report = assess(model, SCENE, times=3)
     assert report.worst is not None
     assert report.worst.ids[0] == worst
-    gap = report.formats[0]
-    assert gap.psnr_without_worst >= gap.psnr
-    exact, view = posed(in_format(model, FLOAT32).double(), report.worst.t), PoseRenderer(SCENE)
+    assert report.float32 is not None
+    assert report.float32.psnr_without_worst >= report.float32.psnr
+    exact, view = in_float64(model)(report.worst.t), PoseRenderer(SCENE)
     others = np.ones(1200, bool)
     others[report.worst.ids] = False
     images = [(view.draw(exact, c, keep=others), view.draw(exact, c)) for c in view.cameras]
@@ -155,21 +117,20 @@ def test_an_unsafe_plan_is_refused_and_an_old_file_stays(tmp_path: Path):
     assert not any(report.refusal(plan) for plan in ("compact:50", "compact:70"))
 
 
-def test_the_command_prints_writes_and_draws(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_the_command_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = saved(tmp_path, random_model(30))
-    assert main(path, tmp_path / "out.json", tmp_path / "out.png", times=3) == 0
+    assert main(path, tmp_path / "out.json", times=3) == 0
     shown = capsys.readouterr().out
-    for text in ("2 (mlp)", "bfloat16", "predicted", "largest errors", "stable: "):
+    for text in ("2 (mlp)", "float32", "predicted", "largest errors", "stable: "):
         assert text in shown
     report = json.loads((tmp_path / "out.json").read_text())
     assert report["stable"] is True
-    assert report["formats"][0]["psnr"] >= tolerance("stability.accepted_db")
-    assert (tmp_path / "out.png").read_bytes().startswith(b"\x89PNG")
+    assert report["float32"]["psnr"] >= tolerance("stability.accepted_db")
 
 
 def test_the_command_flags_a_model_that_overflows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     model = stability_rows.changed(stability_stiff.steps_times(64), **stability_stiff.layers(16))
-    code = main(saved(tmp_path, model), tmp_path / "out.json", tmp_path / "out.png", times=2)
+    code = main(saved(tmp_path, model), tmp_path / "out.json", times=2)
     assert code == UNSTABLE
     assert "unstable in float32" in capsys.readouterr().out
     assert "compact" in json.loads((tmp_path / "out.json").read_text())["verdict"]

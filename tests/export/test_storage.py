@@ -21,7 +21,7 @@ from export.jobs.write import properties, set_properties
 from export.layers.graph import GraphBuilder
 from export.measure.poses import posed
 from export.measure.views import cameras_of
-from export.options import ConvertOptions, ExportOptions
+from export.options import ConvertOptions, ExportOptions, Kept
 from export.plans.registry import build
 from export.storage.choice import COARSEST, GROUPS, fewest_bytes, packed, smallest_error
 from export.storage.kinds import Pack, directions, fractions, in_range, logarithms, low_rank
@@ -42,6 +42,7 @@ from tests.support.tolerances import tolerance
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_candidates")]
 
+FLOAT32: tuple[Kept, ...] = ("float32",)
 FINE = {name: list(group.kinds)[-1] for name, group in GROUPS.items()}
 
 
@@ -140,13 +141,13 @@ def test_each_group_has_arrays_of_some_scene():
 def test_a_written_file_is_smaller_and_its_frames_have_the_error_that_it_says(tmp_path: Path):
     checkpoint = saved(tmp_path, moving_object())
     sizes = {}
-    for keep in (True, False):
-        output = tmp_path / f"{keep}.onnx"
-        assert main(ExportOptions(checkpoint, output, plan="network", min_psnr=45.0, keep_float32=keep, times=4)) == 0
-        sizes[keep] = output.stat().st_size
+    for keep in (FLOAT32, ()):
+        output = tmp_path / f"{len(keep)}.onnx"
+        assert main(ExportOptions(checkpoint, output, plan="network", min_psnr=45.0, keep=keep, times=4)) == 0
+        sizes[len(keep)] = output.stat().st_size
     scene = DeformationSession(output).scene
     (entry,) = (each for each in scene.metadata.left_out if each["rule"] == "float32")
-    kept = DeformationSession(tmp_path / "True.onnx").scene.metadata
+    kept = DeformationSession(tmp_path / "1.onnx").scene.metadata
     assert "float32" not in {each["rule"] for each in kept.left_out}
     assert "storage" not in kept.measured_error
     assert entry["count"] == entry["bytes_saved"] > 0
@@ -155,7 +156,7 @@ def test_a_written_file_is_smaller_and_its_frames_have_the_error_that_it_says(tm
     assert rendered["psnr_worst"] == entry["worst_frame_db"] >= 45
     again = psnr_by_other_programs(output, checkpoint, **rendered["worst_frame"])
     assert again == pytest.approx(rendered["psnr_worst"], abs=tolerance("redrawn"))
-    assert sizes[False] < sizes[True]
+    assert sizes[0] < sizes[1]
     session, any_ids = DeformationSession(output), np.zeros(len(scene), int)  # which only distances depend on
     drawn = ExportJob(checkpoint, tmp_path).exact.measure(session.gaussians, any_ids)
     assert drawn.psnr_worst == rendered["psnr_worst"]
@@ -233,8 +234,8 @@ def test_imported_splats_are_stored_alike(tmp_path: Path):
     splats, out = tmp_path / "a.ply", tmp_path / "a.onnx"
     splats.write_bytes(ply_bytes(inria_columns(some_gaussians(300))))
     sizes = []
-    for keep_float32 in (True, False):
-        assert main(ExportOptions(splats, out, keep_float32=keep_float32)) == 0
+    for keep in (FLOAT32, ()):
+        assert main(ExportOptions(splats, out, keep=keep)) == 0
         sizes.append(out.stat().st_size)
     metadata = DeformationSession(out).scene.metadata
     (entry,) = metadata.left_out
@@ -248,7 +249,7 @@ def test_imported_splats_are_stored_alike(tmp_path: Path):
 )
 def test_unusual_scenes_are_written(tmp_path: Path, count: int, layers: tuple[str, ...], packs: bool):
     model = random_model(count, layers=layers)
-    assert main(ExportOptions(saved(tmp_path, model), quick=True, keep_invisible=True, times=2)) == 0
+    assert main(ExportOptions(saved(tmp_path, model), quick=True, keep=("invisible",), times=2)) == 0
     stored = properties(onnx.load(tmp_path / "model.onnx"))["left_out"]
     assert ("float32" in {entry["rule"] for entry in stored}) == packs
 

@@ -175,7 +175,7 @@ def test_frames_agree_in_what_is_up_and_warn_once(tmp_path: Path):
 
 @pytest.mark.parametrize("kind", ["ply", "splat", "frames"])
 def test_the_option_goes_before_what_the_file_says(tmp_path: Path, kind: str):
-    given: dict[str, Any] = {"up": "0.1 -0.9 0.3", "keep_float32": True}
+    given: dict[str, Any] = {"up": "0.1 -0.9 0.3", "keep": ("float32",)}
     (tmp_path / "f").mkdir()
     if kind == "frames":
         path = frames(tmp_path / "f", "Vertical Axis: z", "Vertical Axis: z")

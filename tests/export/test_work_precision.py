@@ -4,10 +4,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 import pytest
+import tyro
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -18,7 +19,7 @@ from export.jobs.sweep import TIME_MARGIN, Point, QuickEstimate, Sweep, SweepRes
 from export.jobs.timing import FrameTime, Milliseconds
 from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
-from export.options import ExportOptions
+from export.options import ExportOptions, Kept
 from export.pruning import RULES
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
@@ -222,15 +223,15 @@ def test_invalid_options_are_refused_by_name(
     assert not (tmp_path / "s.onnx").exists()
 
 
-@pytest.mark.parametrize(("plan", "keep_float32"), [(None, False), ("network", False), ("network", True)])
+@pytest.mark.parametrize(("plan", "keep"), [(None, ()), ("network", ()), ("network", ("float32",))])
 def test_a_limit_of_bytes_is_kept_with_the_error_that_the_file_says(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: str | None, keep_float32: bool
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: str | None, keep: tuple[Kept, ...]
 ):
     checkpoint, output = saved(tmp_path, moving_object()), tmp_path / "s.onnx"
 
     def exported(max_mb: float, min_psnr: float | None = None) -> str:
         options = ExportOptions(checkpoint, output, max_mb=max_mb, min_psnr=min_psnr, plan=plan, times=4)
-        return capsys.readouterr().err if main(replace(options, keep_float32=keep_float32)) else ""
+        return capsys.readouterr().err if main(replace(options, keep=keep)) else ""
 
     refused = exported(0.001)
     assert "`max_mb` must be at least" in refused
@@ -268,12 +269,22 @@ def test_the_default_error_adds_a_twentieth_of_a_decibel_to_that_of_held_out_ima
 
 
 def test_each_rule_of_pruning_has_a_switch():
-    switches: dict[str, Any] = {f"keep_{rule}": True for rule in RULES}
-    assert ExportOptions(Path("model.pt"), **switches).keep == set(RULES)
+    assert get_args(Kept) == (*RULES, "float32")
+    options = tyro.cli(ExportOptions, args=["model.pt", "--keep", "heads", "sh", "--quick"])
+    assert (options.keep, options.packs) == (("heads", "sh"), True)
+    assert not tyro.cli(ExportOptions, args=["model.pt", "--keep", "float32"]).packs
+
+
+def test_what_else_is_to_be_kept_is_refused_with_what_can_be(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as stopped:
+        tyro.cli(ExportOptions, args=["model.pt", "--keep", "head"])
+    assert stopped.value.code == 2
+    shown = capsys.readouterr().err
+    assert all(f"'{part}'" in shown for part in ("head", *get_args(Kept)))
 
 
 def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(ExportOptions(saved(tmp_path, moving_object()), min_psnr=45.0, keep_sh=True)) == 0
+    assert main(ExportOptions(saved(tmp_path, moving_object()), min_psnr=45.0, keep=("sh",))) == 0
     shown = capsys.readouterr().err
     assert "★" in shown
     scene = DeformationSession(tmp_path / "model.onnx").scene

@@ -39,7 +39,7 @@ COMMANDS = {
         *((name, [], "numpy") for name in COMMANDS),
         ("msdgs-train", ["fit", "data", "run"], "torch"), ("msdgs-train", ["eval", "run"], "torch"),
         ("to_onnx.py", ["model.pt"], "torch"), ("convert.py", ["a.onnx", "a.ply"], "onnxruntime"),
-        ("stability.py", ["model.pt"], "matplotlib"), ("msdgs-serve", ["a.onnx"], "onnxruntime"),
+        ("stability.py", ["model.pt"], "torch"), ("msdgs-serve", ["a.onnx"], "onnxruntime"),
         ("msdgs-render", ["a.onnx", "frames"], "OpenImageIO"),
     ],
 )  # fmt: skip
