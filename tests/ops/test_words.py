@@ -23,6 +23,7 @@ RETIRED = {
     "delta_spaces?_raw|detach_means|embedding_size": "scale_space, detach_deform_input, embedding_dim",
     "trimmed|trimming": "pruned, pruning",
     "half_extent|floored": "scene_half_size, clamped scales",
+    "doorman": "early rejection",
     "lanes_memory|lane_types|LanesType|parts?_of_lanes": "vector_memory, vector_types, VectorType, part_count",
     "serve[./]watch|stopped watch|rasterizer[./]ahead": "render_job, precompile",
     "(?:most|least)_(?!common)\\w+|at_most": "max_*, min_*",
