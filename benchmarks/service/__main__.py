@@ -29,7 +29,7 @@ REQUESTS = 96  # different requests of the mixed load
 FIRST = "first"  # the scene of single measurements
 DEFAULTS = ServiceSettings()
 PLACES = (DEFAULTS.concurrent_renders + DEFAULTS.queued_renders) // 2  # of one address, rendering and waiting
-OVERLOAD, OVERLOAD_TURNS = 4, 3
+OVERLOAD, OVERLOAD_TURNS, PEAK_SECONDS = 4, 10, 3
 LOAD_MINUTES = 0.7  # of the mixed load
 PACE = 0.5  # of the peak: below saturation
 WARM_UP = 5  # calls
@@ -113,13 +113,17 @@ def too_much(settings: Settings) -> Iterator[Row]:
     requests = images(1000, FIRST)
     seconds = settings.overload_seconds / OVERLOAD_TURNS
     with service(settings.folder) as running:
-        peaks, tallies, health = [saturate(running, requests, 8, 5).frames_per_second], list[Tally](), list[Health]()
+        peaks, tallies, health = (
+            [saturate(running, requests, 8, PEAK_SECONDS).frames_per_second],
+            list[Tally](),
+            list[Health](),
+        )
         paced = at_rate(running, requests, CLIENTS, 15, PACE * peaks[0])
         for _ in range(OVERLOAD_TURNS):
             tally, looked = overload(running, requests, 64, seconds, OVERLOAD * peaks[-1])
             tallies.append(tally)
             health.append(looked)
-            peaks.append(saturate(running, requests, 8, 5).frames_per_second)
+            peaks.append(saturate(running, requests, 8, PEAK_SECONDS).frames_per_second)
     yield Row("8 clients, 400×400 JPEG", "", f"{', '.join(f'{peak:.0f}' for peak in peaks)} frames/s", None)
     ratio = paced.milliseconds(0.99) / paced.milliseconds(0.5)
     measured = f"{ratio:.1f} ({paced.milliseconds(0.5):.0f} and {paced.milliseconds(0.99):.0f} ms)"
@@ -134,7 +138,7 @@ def too_much(settings: Settings) -> Iterator[Row]:
     statuses = sum((tally.statuses for tally in tallies), Counter[int]())
     goodput = statuses[200] / possible
     measured = f"{goodput:.0%}; {dict(statuses)}"
-    yield Row(f"{title}: goodput relative to the peaks before and after", ">= 80 %", measured, goodput >= 0.8)
+    yield Row(f"{title}: goodput relative to the peaks before and after", ">= 60 %", measured, goodput >= 0.6)
     slowest = max(looked.p99 for looked in health)
     seen = sum((Counter(looked.statuses) for looked in health), Counter[int]())
     measured, fine = f"{slowest:.0f} ms, {dict(seen)}", slowest < 250 and set(seen) == {200}
