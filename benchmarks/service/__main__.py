@@ -112,12 +112,9 @@ def too_much(settings: Settings) -> Iterator[Row]:
     """
     requests = images(1000, FIRST)
     seconds = settings.overload_seconds / OVERLOAD_TURNS
+    tallies, health = list[Tally](), list[Health]()
     with service(settings.folder) as running:
-        peaks, tallies, health = (
-            [saturate(running, requests, 8, PEAK_SECONDS).frames_per_second],
-            list[Tally](),
-            list[Health](),
-        )
+        peaks = [saturate(running, requests, 8, PEAK_SECONDS).frames_per_second]
         paced = at_rate(running, requests, CLIENTS, 15, PACE * peaks[0])
         for _ in range(OVERLOAD_TURNS):
             tally, looked = overload(running, requests, 64, seconds, OVERLOAD * peaks[-1])
