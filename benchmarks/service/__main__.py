@@ -16,11 +16,12 @@ from typing import Literal
 import numpy as np
 import tyro
 
-from benchmarks.service.faults import ORBIT, changes, counts, faults, kills
+from benchmarks.service.faults import ORBIT, changes, faults, kills
 from benchmarks.service.levels import SCENE, Row, Settings, memory_row, print_rows
 from benchmarks.service.load import Health, Tally, at_rate, overload, saturate
 from benchmarks.service.process import Connection, Running, make_scenes, service
 from benchmarks.service.requests import Offline, Wanted, digest, images, mixed
+from benchmarks.service.soak import shares, soak
 from msdgs_serve.api.settings import Settings as ServiceSettings
 
 CLIENTS = 32
@@ -28,7 +29,8 @@ REQUESTS = 96  # different requests of the mixed load
 FIRST = "first"  # the scene of single measurements
 DEFAULTS = ServiceSettings()
 PLACES = (DEFAULTS.concurrent_renders + DEFAULTS.queued_renders) // 2  # of one address, rendering and waiting
-OVERLOAD, OVERLOAD_TURNS = 4, 3
+OVERLOAD, OVERLOAD_TURNS, PEAK_SECONDS = 4, 10, 3
+LOAD_MINUTES = 0.7  # of the mixed load
 PACE = 0.5  # of the peak: below saturation
 WARM_UP = 5  # calls
 
@@ -79,11 +81,11 @@ def load(settings: Settings) -> Iterator[Row]:
     before = _offline_rate(offline, requests)
     with service(settings.folder, queued_renders=2 * CLIENTS) as running:
         client = time.process_time()
-        tally = saturate(running, requests, CLIENTS, settings.seconds)
+        tally = saturate(running, requests, CLIENTS, settings.seconds(LOAD_MINUTES))
         client = (time.process_time() - client) / tally.lasted
     alone = (before + _offline_rate(offline, requests)) / 2
     bad = {status: count for status, count in tally.statuses.items() if status not in (200, 503)}
-    title = f"{CLIENTS} clients, mixed requests, {settings.seconds:.0f} s"
+    title = f"{CLIENTS} clients, mixed requests, {tally.lasted:.0f} s"
     yield Row(f"{title}: 5xx other than 503", "none", str(bad or "none"), not bad)
     ratio = tally.frames_per_second / alone
     rates = f"{tally.frames_per_second:.1f} of {alone:.1f} frames/s: {ratio:.0%}"
@@ -110,14 +112,15 @@ def too_much(settings: Settings) -> Iterator[Row]:
     """
     requests = images(1000, FIRST)
     seconds = settings.overload_seconds / OVERLOAD_TURNS
+    tallies, health = list[Tally](), list[Health]()
     with service(settings.folder) as running:
-        peaks, tallies, health = [saturate(running, requests, 8, 5).frames_per_second], list[Tally](), list[Health]()
+        peaks = [saturate(running, requests, 8, PEAK_SECONDS).frames_per_second]
         paced = at_rate(running, requests, CLIENTS, 15, PACE * peaks[0])
         for _ in range(OVERLOAD_TURNS):
             tally, looked = overload(running, requests, 64, seconds, OVERLOAD * peaks[-1])
             tallies.append(tally)
             health.append(looked)
-            peaks.append(saturate(running, requests, 8, 5).frames_per_second)
+            peaks.append(saturate(running, requests, 8, PEAK_SECONDS).frames_per_second)
     yield Row("8 clients, 400×400 JPEG", "", f"{', '.join(f'{peak:.0f}' for peak in peaks)} frames/s", None)
     ratio = paced.milliseconds(0.99) / paced.milliseconds(0.5)
     measured = f"{ratio:.1f} ({paced.milliseconds(0.5):.0f} and {paced.milliseconds(0.99):.0f} ms)"
@@ -132,14 +135,14 @@ def too_much(settings: Settings) -> Iterator[Row]:
     statuses = sum((tally.statuses for tally in tallies), Counter[int]())
     goodput = statuses[200] / possible
     measured = f"{goodput:.0%}; {dict(statuses)}"
-    yield Row(f"{title}: goodput relative to the peaks before and after", ">= 80 %", measured, goodput >= 0.8)
+    yield Row(f"{title}: goodput relative to the peaks before and after", ">= 60 %", measured, goodput >= 0.6)
     slowest = max(looked.p99 for looked in health)
     seen = sum((Counter(looked.statuses) for looked in health), Counter[int]())
     measured, fine = f"{slowest:.0f} ms, {dict(seen)}", slowest < 250 and set(seen) == {200}
     yield Row(f"{title}: p99 of /live and /ready, the worst turn", "< 250 ms, all 200", measured, fine)
 
 
-Part = Literal["start", "overhead", "load", "overload", "faults", "changes", "kills", "counts"]
+Part = Literal["start", "overhead", "load", "overload", "faults", "changes", "kills", "shares", "soak"]
 PARTS: dict[Part, Callable[[Settings], Iterator[Row]]] = {
     "start": cold_start,
     "overhead": overhead,
@@ -148,31 +151,39 @@ PARTS: dict[Part, Callable[[Settings], Iterator[Row]]] = {
     "faults": faults,
     "changes": changes,
     "kills": kills,
-    "counts": counts,
+    "shares": shares,
+    "soak": soak,
 }
+SHORT: tuple[Part, ...] = tuple(part for part in PARTS if part not in ("shares", "soak"))
+"""The parts that run unless some are named."""
 
 
-def main(scene: Path = SCENE, only: tuple[Part, ...] = (), minutes: float = 0.7, overload_seconds: float = 60.0) -> int:
+def main(
+    scene: Path = SCENE, only: tuple[Part, ...] = SHORT, minutes: float | None = None, overload_seconds: float = 60.0
+) -> int:
     """Measure the service levels in under 5 minutes. The exit status is 1 if a bound isn't met.
 
     python -m benchmarks.service
 
     python -m benchmarks.service --only load --minutes 5
 
+    python -m benchmarks.service --only soak
+
     Use an idle machine. Clients run on it too and take part of its processor time.
 
     Args:
         scene: A scene file whose time range is [0, 1].
-        only: Run these parts.
-        minutes: Duration of the mixed load; the documented levels are for 5.
+        only: Run these parts, of which `shares` and `soak` take longer than all others.
+        minutes: Duration of a long part: by default 0.7 for the mixed load, whose documented levels are for 5, 0.5 for
+            each half of `shares`, and 30 for `soak`.
         overload_seconds: Duration of the overload.
     """
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that services are stopped too
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as work:
         folder = make_scenes(Path(work) / "scenes", scene)
-        settings = Settings(scene, folder, 60 * minutes, overload_seconds, Path(work))
-        for name in only or PARTS:
+        settings = Settings(scene, folder, Path(work), minutes, overload_seconds)
+        for name in only:
             print(f"{name}: {(PARTS[name].__doc__ or '').splitlines()[0]}", flush=True)
             for row in PARTS[name](settings):
                 rows.append(row)

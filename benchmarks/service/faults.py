@@ -6,7 +6,6 @@ import json
 import os
 import select
 import shutil
-import signal
 import socket
 import threading
 import time
@@ -17,64 +16,54 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.service.levels import Row, Settings
+from benchmarks.service.load import saturate
 from benchmarks.service.process import JSON, Connection, Running, service
-from benchmarks.service.requests import digest
+from benchmarks.service.requests import Wanted, digest
 from tests.support.processes import wait_for
 from tests.support.scene_files import write_scene
 
 ORBIT = {"type": "orbit", "azimuth": 30, "elevation": 20}
 SMALL = {"camera": ORBIT, "t": 0.5, "width": 16, "height": 16}
-IN_FLIGHT, SLOW_SOCKETS, RELOADS, RELOAD_CLIENTS, KILLS, COUNTED = 8, 200, 100, 4, 5, 10_000
+SLOW_SOCKETS, RELOADS, RELOAD_CLIENTS, KILLS = 200, 100, 4, 5
+RELOAD_SECONDS = 0.15
 HALF_A_CALL = b"POST /render HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000\r\n\r\n{"
 SLOW_BEGINNINGS = (b"", b"GET /live HTTP/1.1\r\n", HALF_A_CALL)
 SLOW_PATIENCE = 30.0
 
 
 def faults(settings: Settings) -> Iterator[Row]:
-    """Clients that disconnect, are slow or ask for too much; a SIGTERM while frames are rendered."""
+    """Clients that disconnect, are slow or ask for too much."""
     yield _disconnects(settings.scene)
     yield _deadline(settings.scene)
-    yield _shutdown(settings.scene)
     yield _slow_sockets(settings.scene)
 
 
 def changes(settings: Settings) -> Iterator[Row]:
     """A scene file that is replaced a hundred times under load."""
     folder = settings.work / "changing"
-    versions, scene, stop = _versions(folder), folder / "scene.onnx", threading.Event()
-    seen: Counter[str] = Counter()
-    statuses: Counter[int] = Counter()
-    body = {**SMALL, "scene": "scene", "width": 96, "height": 96}
+    versions, scene = _versions(folder), folder / "scene.onnx"
+    wanted = Wanted("scene", 30.0, 0.5, 96, "png")
 
     def put(version: Path) -> None:
         shutil.copyfile(version, folder / "new")
         os.replace(folder / "new", scene)
 
-    def ask(port: int) -> None:
-        with contextlib.closing(Connection(port)) as connection:
-            while not stop.is_set():
-                answer = connection.ask("POST", "/render", body)
-                statuses[answer.status] += 1
-                seen[digest(answer.body)] += 1
-
     put(versions[0])
-    with service(folder, watch_seconds=0.05) as running, ThreadPoolExecutor(RELOAD_CLIENTS) as pool:
+    with service(folder, watch_seconds=0.05) as running, ThreadPoolExecutor(1) as pool:
         known = set()
         for version in (*versions, versions[0]):
             put(version)
             time.sleep(1)
-            known.add(digest(running.ask("POST", "/render", body).body))
+            known.add(digest(running.ask("POST", "/render", wanted.body()).body))
         assert len(known) == len(versions)
-        clients = [pool.submit(ask, running.port) for _ in range(RELOAD_CLIENTS)]
+        clients = pool.submit(saturate, running, [wanted], RELOAD_CLIENTS, RELOADS * RELOAD_SECONDS)
         for number in range(RELOADS):
             put(versions[(number + 1) % 2])
-            time.sleep(0.15)
-        stop.set()
-        for client in clients:
-            client.result()
-    mixed = sum(times for frame, times in seen.items() if frame not in known)
-    measured = f"{mixed} of {seen.total()} frames match no version, {dict(statuses)}"
-    fine = not mixed and set(statuses) == {200}
+            time.sleep(RELOAD_SECONDS)
+        tally = clients.result()
+    mixed = sum(times for (_, frame), times in tally.bodies.items() if frame not in known)
+    measured = f"{mixed} of {tally.bodies.total()} frames match no version, {dict(tally.statuses)}"
+    fine = not mixed and set(tally.statuses) == {200}
     yield Row(f"{RELOADS} reloads under load: frames of mixed versions", "none", measured, fine)
 
 
@@ -95,29 +84,6 @@ def kills(settings: Settings) -> Iterator[Row]:
                 uploads += _uploads_until_killed(running, folder, contents, 0.5 + 0.1 * number)
     measured = f"{whole} of {KILLS}, after {uploads} uploads"
     yield Row("kill -9 during uploads: a whole scene, no other file left", "all", measured, whole == KILLS)
-
-
-def counts(settings: Settings) -> Iterator[Row]:
-    """The request counters of /metrics against a client's own."""
-    kinds: list[tuple[str, str, Any, dict[str, str] | None]] = [
-        ("POST", "/render", SMALL, None),
-        ("POST", "/render", {**SMALL, "t": 7}, None),
-        ("POST", "/render", SMALL, {"If-None-Match": "*"}),
-        ("GET", "/live", None, None),
-        ("GET", "/scenes", None, None),
-    ]
-    counted: Counter[str] = Counter()
-    with service(settings.folder / "balls.onnx") as running, contextlib.closing(Connection(running.port)) as connection:
-        for number in range(COUNTED):
-            method, path, body, headers = kinds[number % len(kinds)]
-            status = connection.ask(method, path, body, headers).status
-            counted[f'{{method="{method}",route="{path}",status="{status}"}}'] += 1
-        text = connection.ask("GET", "/metrics").body.decode()
-    lines = [line.removeprefix("msdgs_requests_total").rsplit(" ", 1) for line in text.splitlines()
-             if line.startswith("msdgs_requests_total{") and 'route="/ready"' not in line]  # fmt: skip
-    agree = {labels: float(value) for labels, value in lines} == dict(counted) and len(counted) == len(kinds)
-    measured = "equal" if agree else "different"
-    yield Row(f"metrics after {COUNTED:,} requests and the client's counts", "equal", measured, agree)
 
 
 def _disconnects(scene: Path) -> Row:
@@ -153,20 +119,6 @@ def _deadline(scene: Path) -> Row:
         assert running.ask("POST", "/render", _long_frame(800, 10_000)).status == 504
         late = time.monotonic() - started
     return Row("1 s deadline on a render of more than 10 s: 504 after", "1.5 s", f"{late:.2f} s", late < 1.5)
-
-
-def _shutdown(scene: Path) -> Row:
-    """Whether 8 frames in flight are finished after SIGTERM, while /ready says 503 and /live 200."""
-    with service(scene) as running, ThreadPoolExecutor(IN_FLIGHT) as pool:
-        frames = [pool.submit(running.ask, "POST", "/render", _long_frame(300, 16)) for _ in range(IN_FLIGHT)]
-        names = ("msdgs_queue_waiting", "msdgs_renders_running")
-        wait_for(lambda: sum(map(running.metric, names)) == IN_FLIGHT)
-        running.process.send_signal(signal.SIGTERM)
-        time.sleep(0.1)
-        health = [running.ask("GET", path).status for path in ("/ready", "/live")]
-        statuses = {frame.result().status for frame in frames}
-        fine = health == [503, 200] and statuses == {200} and running.process.wait(30) == 0
-    return Row(f"SIGTERM with {IN_FLIGHT} in flight: all finish, /ready 503", "yes", "yes" if fine else "no", fine)
 
 
 def _slow_sockets(scene: Path) -> Row:

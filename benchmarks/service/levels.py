@@ -26,10 +26,14 @@ class Settings(NamedTuple):
     """Inputs of every part of the benchmark."""
 
     scene: Path  # a scene file
-    folder: Path  # scene files
-    seconds: float  # duration of the mixed load
-    overload_seconds: float
-    work: Path  # an empty folder for files that are written
+    folder: Path  # of three scenes, see `make_scenes`
+    work: Path  # a folder for files that are written
+    minutes: float | None = None  # duration of a long part, if it isn't that part's own
+    overload_seconds: float = 60.0
+
+    def seconds(self, minutes: float) -> float:
+        """The duration of a part that takes `minutes` by default."""
+        return 60 * (minutes if self.minutes is None else self.minutes)
 
 
 def print_rows(rows: Iterable[Row]) -> bool:

@@ -7,18 +7,15 @@ import re
 import shutil
 import subprocess
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tests.support.processes import free_port
+from tests.support.processes import free_port, wait_for
 from tests.support.scene_files import write_scene
 
-NGINX = Path(__file__).resolve().parents[2] / "docker" / "nginx" / "nginx.conf"
 START_SECONDS = 120
-MOMENT = 0.01
 PROGRAM = "import sys; from msdgs_serve.api.cli import main; sys.exit(main())"
 JSON = {"Content-Type": "application/json"}
 NONE: dict[str, str] = {}
@@ -69,11 +66,8 @@ class Running(NamedTuple):
 
     def ask(self, method: str, path: str, body: Any = None) -> Answer:
         """Send a request on a new connection."""
-        connection = Connection(self.port)
-        try:
+        with closing(Connection(self.port)) as connection:
             return connection.ask(method, path, body)
-        finally:
-            connection.close()
 
     def metric(self, name: str) -> float:
         """The value of a metric without labels."""
@@ -95,55 +89,33 @@ class Running(NamedTuple):
         return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
-def service(*scenes: Path, **flags: Any) -> AbstractContextManager[Running]:
-    """Run `msdgs-serve` with these scenes; `flag=value` stands for `--flag value`, `flag=True` for `--flag`."""
+@contextmanager
+def service(*scenes: Path, **flags: Any) -> Iterator[Running]:
+    """Run `msdgs-serve` with these scenes until the end of the block, and wait until it is ready; `flag=value` stands
+    for `--flag value`, `flag=True` for `--flag`."""
     port = free_port()
     options = [
-        text for name, value in flags.items()
+        text for name, value in {"port": port, **flags}.items()
         for text in (f"--{name.replace('_', '-')}", *([] if value is True else [str(value)]))
     ]  # fmt: skip
-    return _running([sys.executable, "-c", PROGRAM, *map(str, scenes), "--port", str(port), *options], port)
-
-
-@contextmanager
-def _running(command: Sequence[str], port: int) -> Iterator[Running]:
-    """A process that is ready at a port, terminated at the end of the block."""
+    command = [sys.executable, "-c", PROGRAM, *map(str, scenes), *options]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        running = Running(port, process)
         try:
-            running = Running(port, process)
-            wait_until_ready(running)
+            wait_for(lambda: _is_ready(running), START_SECONDS)
             yield running
         finally:
             process.terminate()
             process.wait()
 
 
-def wait_until_ready(running: Running) -> None:
-    """Wait until scenes are loaded and kernels are compiled."""
-    deadline = time.monotonic() + START_SECONDS
-    while time.monotonic() < deadline and running.process.poll() is None:
-        with suppress(OSError, http.client.HTTPException):
-            if running.ask("GET", "/ready").status == 200:
-                return
-        time.sleep(MOMENT)
-    raise SystemExit("the service did not become ready")
-
-
-@contextmanager
-def proxy(running: Sequence[Running], work: Path) -> Iterator[int]:
-    """The port of nginx with docker/'s settings in front of these services; needs `nginx` (Debian: nginx-light)."""
-    program = shutil.which("nginx", path=f"{os.environ['PATH']}:/usr/sbin")
-    if program is None:
-        raise SystemExit("nginx is not installed; on Debian: apt-get install nginx-light")
-    port, folder = free_port(), work / "nginx"
-    folder.mkdir()
-    settings = NGINX.read_text().replace("listen 8080", f"listen {port}").replace("/tmp/", f"{folder}/")
-    (folder / "nginx.conf").write_text(settings)
-    (folder / "replicas.conf").write_text("".join(f"server 127.0.0.1:{each.port} max_fails=0;\n" for each in running))
-    user = "user root;" if os.geteuid() == 0 else ""  # or the worker couldn't enter `work`
-    command = [program, "-c", str(folder / "nginx.conf"), "-g", f"daemon off; {user}"]
-    with _running(command, port):
-        yield port
+def _is_ready(running: Running) -> bool:
+    """Whether scenes are loaded and kernels are compiled."""
+    if running.process.poll() is not None:
+        raise SystemExit("the service has ended")
+    with suppress(OSError, http.client.HTTPException):
+        return running.ask("GET", "/ready").status == 200
+    return False
 
 
 def make_scenes(folder: Path, scene: Path) -> Path:

@@ -1,4 +1,4 @@
-"""Shares of the queue, and a long mixed load on two services: a table of bounds and whether they are met."""
+"""Shares of the queue, and a long mixed load on two services behind nginx with the settings of docker/."""
 
 import base64
 import io
@@ -7,8 +7,6 @@ import multiprocessing
 import os
 import random
 import socket
-import sys
-import tempfile
 import threading
 import time
 from collections import Counter
@@ -16,22 +14,23 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import av
 import numpy as np
 import onnx
-import tyro
 
-from benchmarks.service.levels import SCENE, Row, memory_row, print_rows
+from benchmarks.service.levels import Row, Settings, memory_row
 from benchmarks.service.load import watch_health
-from benchmarks.service.process import Answer, Connection, Running, make_scenes, proxy, service
+from benchmarks.service.process import Answer, Connection, Running, service
 from benchmarks.service.requests import Offline, Wanted, digest, images, mixed
+from tests.support.proxied_replicas import running_nginx
 from tests.support.scene_files import write_scene
 
 CLIENTS, NEIGHBORS = 16, 8
 CATALOGUE, BATCH, BATCH_BESIDE, VIDEO_FRAMES = 48, 12, 200, 8
 COLORS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+SHARES_MINUTES, SOAK_MINUTES = 0.5, 30.0  # the first: of each half
 MAX_WAIT = 5.0
 MAX_VIDEO_DIFFERENCE = 1.0  # mean difference of two videos of the same frames, of 255
 SAMPLE_SECONDS = 1.0
@@ -82,11 +81,11 @@ class Client:
         self._connection.close()
 
 
-def shares(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
+def shares(settings: Settings) -> Iterator[Row]:
     """p99 of one client's single frames beside eight clients of single frames, and beside eight of batches."""
-    wanted = images(BATCH_BESIDE, scene.stem)
+    wanted, seconds = images(BATCH_BESIDE, settings.scene.stem), settings.seconds(SHARES_MINUTES)
     batch = {"frames": [each.body() for each in wanted]}
-    with services(scene, work, 1) as running:
+    with services(settings.scene, settings.work, 1) as running:
         times = {
             path: _beside(running, seconds, wanted[0].body(), path, body)
             for path, body in (("/render", wanted[0].body()), ("/render/batch", batch))
@@ -251,18 +250,20 @@ def _external(scene: Path) -> bytes:
     return model.SerializeToString()
 
 
-def soak(scene: Path, work: Path, seconds: float) -> Iterator[Row]:
+def soak(settings: Settings) -> Iterator[Row]:
     """Sixteen clients on two services: no wrong answer, no lost or leftover file, no growing memory."""
-    folder = make_scenes(work / "scenes", scene)
-    (work / "small").mkdir()
+    folder, seconds = settings.folder, settings.seconds(SOAK_MINUTES)
+    small, nginx = settings.work / "small", settings.work / "nginx"
+    small.mkdir()
+    nginx.mkdir()
     before = sorted(path.name for path in folder.iterdir())
     with (
-        services(folder, work, 2, uploads=True, body_seconds=5, queued_renders=2 * CLIENTS) as running,
-        proxy(running, work) as port,
+        services(folder, settings.work, 2, uploads=True, body_seconds=5, queued_renders=2 * CLIENTS) as running,
+        running_nginx(nginx, [each.port for each in running], read_seconds=60) as proxy,
         ProcessPoolExecutor(len(running), multiprocessing.get_context("spawn")) as watching,
         ThreadPoolExecutor(CLIENTS) as pool,
     ):
-        mixture = Soak(folder, work / "small", port, seconds=seconds)
+        mixture = Soak(folder, small, proxy.base_url.port or 0, seconds=seconds)
         health = [watching.submit(watch_health, each.port, seconds) for each in running]
         clients = [pool.submit(mixture.client, number) for number in range(CLIENTS)]
         samples = list(_samples(running, clients))
@@ -295,34 +296,3 @@ def _samples(running: list[Running], clients: Sequence[Any]) -> Iterator[list[tu
 
 def _handles(running: Running) -> int:
     return len(os.listdir(f"/proc/{running.process.pid}/fd"))
-
-
-def main(
-    part: Annotated[Literal["shares", "soak"], tyro.conf.Positional], scene: Path = SCENE, minutes: float | None = None
-) -> int:
-    """Measure shares of the queue, or a long mixed load on two services. The exit status is 1 if a bound isn't met.
-
-    `shares`: single frames beside clients of batches and beside clients of single frames.
-
-    `soak`: frames, batches, videos, uploads, damaged and hostile files, on two services that share a folder behind
-    nginx with the settings of docker/.
-
-    python -m benchmarks.service.soak shares
-
-    python -m benchmarks.service.soak soak --minutes 30
-
-    Each client has a key of its own. Use an idle machine.
-
-    Args:
-        part: The measurement.
-        scene: A scene file whose time range is [0, 1].
-        minutes: By default 30 for `soak` and 0.5 for each half of `shares`.
-    """
-    measure, default = (soak, 30.0) if part == "soak" else (shares, 0.5)
-    with tempfile.TemporaryDirectory() as work:
-        met = print_rows(measure(scene, Path(work), 60 * (minutes or default)))
-    return 0 if met else 1
-
-
-if __name__ == "__main__":
-    sys.exit(tyro.cli(main))

@@ -126,6 +126,8 @@ def test_a_list_of_times_gives_arrays_of_as_many_frames(client: Client, times: A
     one = client.render(LEVEL, times[:1], width=16, height=12).depth
     assert one is not None
     assert one.shape == (1, 12, 16)
+    with pytest.raises(Problem, match="POST /render/batch"):
+        client.render_file(LEVEL, times, width=16, height=12)
 
 
 NO_NUMBERS = [

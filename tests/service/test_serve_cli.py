@@ -121,7 +121,7 @@ def test_help_shows_examples_and_each_option_in_its_group(capsys: pytest.Capture
         ([], "no scene given"),
         (["missing.onnx"], "missing.onnx, which does not exist"),
         (["model.pt"], "export/to_onnx.py"),
-        (["broken.onnx"], "broken.onnx: `file`"),
+        (["broken.onnx", "--port", "0"], "broken.onnx: `file`"),
         (["balls.onnx", "--port", "70000"], "--port: "),
         (["balls.onnx", "--max-pixels", "many"], "--max-pixels: "),
         (["balls.onnx", "--host", "256.1.1.1"], "can't listen on 256.1.1.1"),

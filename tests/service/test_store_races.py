@@ -9,7 +9,6 @@ from unittest.mock import Mock
 import pytest
 
 from msdgs_serve import store as store_module
-from msdgs_serve.api.choice import fastest_within
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.store import RETRY_SECONDS, SceneExists, SceneStore
@@ -110,21 +109,3 @@ def test_scenes_are_added_where_files_can_not_be_linked(folder: Path, monkeypatc
     store = SceneStore([folder])
     store.add("walk", write_scene(store.incoming("token")))
     assert [path.name for path in folder.iterdir()] == ["walk.onnx"]
-
-
-@pytest.mark.parametrize("after", ["names", "get"])
-def test_a_file_that_is_removed_during_the_choice_by_error_fails_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: str
-):
-    for name, psnr in (("walk", 60), ("walk.fast", 40)):
-        write_scene(tmp_path / f"{name}.onnx", measured_error={"rendered": {"psnr_worst": psnr}})
-    store = SceneStore([tmp_path])
-    scene, original = store.get("walk"), getattr(store, after)
-
-    def removing(*arguments: str) -> Any:
-        answer = original(*arguments)
-        (tmp_path / "walk.fast.onnx").unlink(missing_ok=True)
-        return answer
-
-    monkeypatch.setattr(store, after, removing)
-    assert fastest_within(store, scene, 30).name in ("walk", "walk.fast")

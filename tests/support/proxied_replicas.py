@@ -20,7 +20,7 @@ from tests.support.processes import ROOT, free_port, wait_for
 
 SETTINGS = ROOT / "docker" / "nginx"
 READ_SECONDS = 1
-"""How long nginx waits for a frame in tests."""
+"""How long nginx waits for a frame in tests of that."""
 
 
 class Server(ThreadingHTTPServer):
@@ -125,7 +125,7 @@ def proxying(folder: Path, *statuses: int | None) -> Iterator[Proxy]:
 
 
 @contextlib.contextmanager
-def running_nginx(folder: Path, ports: list[int]) -> Iterator[httpx.Client]:
+def running_nginx(folder: Path, ports: list[int], read_seconds: int = READ_SECONDS) -> Iterator[httpx.Client]:
     """Run nginx with the settings of docker/nginx, in front of these ports of this machine."""
     port = free_port()
     changes = {
@@ -133,7 +133,7 @@ def running_nginx(folder: Path, ports: list[int]) -> Iterator[httpx.Client]:
         r" /dev/stdout": f" {folder}/access.log",
         r"worker_processes auto": "worker_processes 1",
         r"listen 8080": f"listen 127.0.0.1:{port}",
-        r"(?m)^    proxy_read_timeout \d+s": f"    proxy_read_timeout {READ_SECONDS}s",
+        r"(?m)^    proxy_read_timeout \d+s": f"    proxy_read_timeout {read_seconds}s",
     }
     settings = (SETTINGS / "nginx.conf").read_text()
     for pattern, value in changes.items():
