@@ -1,6 +1,6 @@
 """`msdgs-render`: render a camera path through scenes as images or a video, on this machine or a Ray cluster.
 
-Continues where an earlier run was stopped.
+After Ctrl-C the same command continues where it was stopped.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
-from msdgs_serve.imaging.formats import default_channels
+from msdgs_serve.imaging.formats import DEFAULT_QUALITY, default_channels
 from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
@@ -46,8 +46,6 @@ examples:
   msdgs-render scene.onnx frames/ --format exr --dt 0.02    color, alpha, depth and motion vectors, for compositing
   msdgs-render views.json frames/                           a path whose cameras each name their "scene"
   msdgs-render scene.onnx frames/ --ray auto                on the Ray cluster of this machine, or at an address
-
-After Ctrl-C, the same command continues where it was stopped.
 """
 
 
@@ -70,28 +68,36 @@ def _parser() -> argparse.ArgumentParser:
         PROGRAM, description=__doc__, epilog=EXAMPLES, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     scene = 'a scene file (.onnx), or a camera path (.json) in which each camera names one as "scene"'
-    parser.add_argument("scene", type=Path, help=scene)
-    parser.add_argument("out", type=Path, help="a folder for images, or a video: name.mp4, name.webm or name.webp")
-    parser.add_argument(
-        "--path", type=Path, help="a camera path in nerfstudio's format; default: one turn around the scene"
-    )
-    parser.add_argument("--frames", type=int, default=60, help="frames of the turn (default 60)")
-    parser.add_argument("--elevation", type=float, default=20.0, help="elevation of the turn, degrees (default 20)")
-    parser.add_argument(
-        "--fps", type=float, help=f"frames per second of a video; default: the path's, else {DEFAULT_FPS:g}"
-    )
-    parser.add_argument(
-        "--width", type=int, help="image width, pixels; default: the path's, else the scene's first camera's"
-    )
-    parser.add_argument("--height", type=int, help="image height, pixels; required with --width")
-    parser.add_argument("--format", choices=get_args(ImageFormat), default="png", help="format of images (default png)")
-    parser.add_argument("--quality", type=int, help="quality of jpeg and webp, 1 to 100")
-    motion = "exr and npy also hold motion vectors from each frame's time to so much later, in the scene's time"
-    parser.add_argument("--dt", type=float, help=motion)
-    parser.add_argument("--transparent", action="store_true", help="render images without a background")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help=scene)
+    out = "a folder for images, or a video: name.mp4, name.webm or name.webp; videos need pip install 'msdgs[video]'"
+    parser.add_argument("out", type=Path, metavar="OUT", help=out)
+    _add_path_options(parser.add_argument_group("cameras and times"))
+    _add_output_options(parser.add_argument_group("images and videos"))
     ray = "render on a Ray cluster: `auto` for that of this machine (started if there is none), or its address"
-    parser.add_argument("--ray", metavar="ADDRESS", help=ray)
+    parser.add_argument_group("more machines").add_argument("--ray", metavar="ADDRESS", help=ray)
     return parser
+
+
+def _add_path_options(group: argparse._ArgumentGroup) -> None:
+    path = "a camera path in nerfstudio's format; default: one turn around the scene during its time range"
+    group.add_argument("--path", type=Path, metavar="JSON", help=path)
+    group.add_argument("--frames", type=int, default=60, metavar="COUNT", help="frames of the turn (default 60)")
+    elevation = "elevation of the turn above the horizon (default 20)"
+    group.add_argument("--elevation", type=float, default=20.0, metavar="DEGREES", help=elevation)
+    width = "image width; default: the path's, else that of the scene's first camera"
+    group.add_argument("--width", type=int, metavar="PIXELS", help=width)
+    group.add_argument("--height", type=int, metavar="PIXELS", help="image height, given together with --width")
+
+
+def _add_output_options(group: argparse._ArgumentGroup) -> None:
+    fps = f"frames per second of a video; default: the path's, else {DEFAULT_FPS:g}"
+    group.add_argument("--fps", type=float, help=fps)
+    group.add_argument("--format", choices=get_args(ImageFormat), default="png", help="format of images (default png)")
+    quality = f"quality of jpeg and webp, 1 to 100 (default {DEFAULT_QUALITY})"
+    group.add_argument("--quality", type=int, metavar="NUMBER", help=quality)
+    motion = "exr and npy also hold motion vectors, from each frame's time to this much later, in the scene's time"
+    group.add_argument("--dt", type=float, metavar="TIME", help=motion)
+    group.add_argument("--transparent", action="store_true", help="render images without a background")
 
 
 def _run(options: argparse.Namespace) -> None:
