@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import tyro
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.settings import optional
 
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 Kept = Literal["heads", "modulation", "layers", "invisible", "static", "sh", "float32"]
 """The rules of pruning, and float32."""
 
@@ -23,7 +24,7 @@ class ExportOptions:
     frame has at least --min-psnr is written, the smallest of several that are about as fast, or with --max-mb the most
     exact that fits; and beside it a report: error against run time and bytes.
 
-    Type this:
+    Example, then view it at http://localhost:8000:
 
     python export/to_onnx.py runs/ball/model.pt -o scenes/ball.onnx
 
@@ -39,34 +40,34 @@ class ExportOptions:
     python export/to_onnx.py runs/ball/model.pt --quick
     """
 
-    model: Annotated[Path, tyro.conf.Positional]
+    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """The `model.pt` of a training run, or a file or folder of another program."""
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None
+    output: Annotated[Path | None, optional("PATH", aliases=["-o"])] = None
     """The scene file to write; by default beside the model, ending in .onnx."""
     format: Annotated[str, tyro.conf.arg(metavar="FORMAT")] = "detect"
     """Format of the input, as docs/formats.md lists them: model, ply, ..., deformgs, 4dgs. `detect` looks inside."""
-    min_psnr: float | None = None
-    """PSNR of the worst frame against the exact network, dB; less is faster. By default 50, from where no difference is
+    min_psnr: Annotated[float | None, optional("DB")] = None
+    """PSNR of the worst frame against the exact network; less is faster. By default 50, from where no difference is
     visible; with --data what adds 0.05 dB to the error against held-out images; with --max-mb alone no limit."""
-    max_mb: float | None = None
+    max_mb: Annotated[float | None, optional("MB")] = None
     """Largest size of the file, in megabytes of 10⁶ bytes. Alone: the highest PSNR that fits, at any speed. With
     --min-psnr: the fastest that keeps both."""
-    plan: str | None = None
+    plan: Annotated[str | None, optional("PLAN")] = None
     """Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all."""
     quick: Flag = False
     """No sweep and no report: the plan `network`, pruned."""
-    data: Path | None = None
+    data: Annotated[Path | None, optional("DATA")] = None
     """The folder of the dataset. Errors are measured from its training cameras, and held-out images compared."""
-    keep: tuple[Kept, ...] = ()
+    keep: Annotated[tuple[Kept, ...], tyro.conf.arg(help_behavior_hint="")] = ()
     """What to keep although it has no visible effect: `heads`, scale `modulation`, `layers`, `invisible` Gaussians, the
     motion of `static` ones, upper `sh` bands. With `float32` arrays aren't stored in fewer bits."""
     tolerance: float = 1e-4
     """Largest relative error of poses that the plan `network` may have against the model's layers."""
-    duration: float | None = None
+    duration: Annotated[float | None, optional("SECONDS")] = None
     """Seconds that the scene's time range lasts, which the file then says: the web page plays it at that speed."""
     times: int = 50
-    """The number of times at which these are compared."""
-    up: Annotated[str | None, tyro.conf.arg(metavar="AXIS")] = None
+    """The number of times, over the time range, at which the written poses are compared with the model's."""
+    up: Annotated[str | None, optional("AXIS")] = None
     """Which direction is up in a splat or a sequence: x, y, z, -x, -y, -z, or three numbers such as 0 -1 0.2. By
     default what the file says, as those of ns-export do, otherwise -y."""
 
@@ -114,16 +115,16 @@ class ConvertOptions:
     For videos use msdgs-render: msdgs-render ball.onnx turn.mp4. docs/formats.md lists what each format keeps.
     """
 
-    scene: Annotated[Path, tyro.conf.Positional]
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """A scene file (.onnx)."""
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The output: name.ply, .spz, .glb, .usdc (or .usda, .usd), .visionary.onnx, .onnx, or a folder."""
-    t: float | None = None
+    t: Annotated[float | None, optional("TIME")] = None
     """The time of a single file; by default the start of the scene's time range."""
     frames: int = 30
     """The number of files in a folder or frames of OpenUSD, evenly over the time range, including both ends."""
-    min_psnr: float | None = None
-    """PSNR of the written file against the scene, dB, below which it isn't kept; by default 45 for SPZ and Visionary,
+    min_psnr: Annotated[float | None, optional("DB")] = None
+    """PSNR of the written file against the scene, below which it isn't kept; by default 45 for SPZ and Visionary,
     50 for scene files, and 60 for the others, which are lossless."""
 
 

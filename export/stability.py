@@ -17,14 +17,15 @@ from typing import Annotated
 from export.command_line import Console, run, tyro
 from export.options import require_folder_of
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.settings import optional
 
 UNSTABLE = 3
 """Exit status if the model is unstable; 2 is an error."""
 
 
 def main(
-    model: Annotated[Path, tyro.conf.Positional],
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")],
+    json: Annotated[Path | None, optional("PATH")] = None,
     times: int = 20,
     min_psnr: float = 50.0,
 ) -> int:

@@ -1,4 +1,7 @@
-"""`msdgs-render`: render a camera path through scenes as images or a video, on this machine or a Ray cluster."""
+"""`msdgs-render`: render a camera path through scenes as images or a video, on this machine or a Ray cluster.
+
+After Ctrl-C the same command continues where it was stopped.
+"""
 
 import argparse
 import hashlib
@@ -22,7 +25,7 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import FORMATS, ImageFormat
 from msdgs_serve.imaging.encode import check_encodable
-from msdgs_serve.imaging.formats import default_channels
+from msdgs_serve.imaging.formats import DEFAULT_QUALITY, default_channels
 from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
@@ -43,8 +46,6 @@ Render a camera path through scenes as images or a video, on this machine or a R
   msdgs-render scene.onnx frames/ --format exr --dt 0.02    color, alpha, depth and motion vectors, for compositing
   msdgs-render views.json frames/                           a path whose cameras each name their "scene"
   msdgs-render scene.onnx frames/ --ray auto                on the Ray cluster of this machine, or at an address
-
-After Ctrl-C, the same command continues where it was stopped.
 """
 
 
@@ -69,28 +70,37 @@ def _parser() -> argparse.ArgumentParser:
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add = parser.add_argument
     scene = 'Scene file (.onnx), or camera path (.json) in which each camera names one as "scene".'
-    add("scene", type=Path, metavar="SCENE", help=scene)
-    add("out", type=Path, metavar="OUT", help="Folder for images, or video: name.mp4, name.webm or name.webp.")
-    path = "Camera path in nerfstudio's format; by default one turn around the scene."
-    add("--path", type=Path, metavar="PATH", help=path)
-    add("--frames", type=int, metavar="INT", default=60, help="Frames of the turn. (default: 60)")
-    elevation = "Elevation of the turn, degrees. (default: 20)"
-    add("--elevation", type=float, metavar="FLOAT", default=20.0, help=elevation)
-    fps = f"Frames per second of a video; by default the path's, else {DEFAULT_FPS:g}."
-    add("--fps", type=float, metavar="FLOAT", help=fps)
-    width = "Image width, pixels; by default the path's, else that of the scene's first camera."
-    add("--width", type=int, metavar="INT", help=width)
-    add("--height", type=int, metavar="INT", help="Image height, pixels; required with --width.")
-    add("--format", choices=get_args(ImageFormat), default="png", help="Format of images. (default: png)")
-    add("--quality", type=int, metavar="INT", help="Quality of jpeg and webp, 1 to 100.")
-    motion = "For exr and npy: add motion vectors from each frame's time to this much later, in the scene's time."
-    add("--dt", type=float, metavar="FLOAT", help=motion)
-    add("--transparent", action="store_true", help="Render images without a background.")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help=scene)
+    out = "Folder for images, or video: name.mp4, name.webm or name.webp, which needs pip install 'msdgs[video]'."
+    parser.add_argument("out", type=Path, metavar="OUT", help=out)
+    _add_path_options(parser.add_argument_group("cameras and times"))
+    _add_output_options(parser.add_argument_group("images and videos"))
     ray = "Render on a Ray cluster: `auto` for that of this machine (started if there is none), or its address."
-    add("--ray", metavar="ADDRESS", help=ray)
+    parser.add_argument_group("more machines").add_argument("--ray", metavar="ADDRESS", help=ray)
     return parser
+
+
+def _add_path_options(group: argparse._ArgumentGroup) -> None:
+    path = "Camera path in nerfstudio's format; by default one turn around the scene during its time range."
+    group.add_argument("--path", type=Path, metavar="JSON", help=path)
+    group.add_argument("--frames", type=int, default=60, metavar="COUNT", help="Frames of the turn. (default: 60)")
+    elevation = "Elevation of the turn above the horizon. (default: 20)"
+    group.add_argument("--elevation", type=float, default=20.0, metavar="DEGREES", help=elevation)
+    width = "Image width; by default the path's, else that of the scene's first camera."
+    group.add_argument("--width", type=int, metavar="PIXELS", help=width)
+    group.add_argument("--height", type=int, metavar="PIXELS", help="Image height, given together with --width.")
+
+
+def _add_output_options(group: argparse._ArgumentGroup) -> None:
+    fps = f"Frames per second of a video; by default the path's, else {DEFAULT_FPS:g}."
+    group.add_argument("--fps", type=float, help=fps)
+    group.add_argument("--format", choices=get_args(ImageFormat), default="png", help="Format of images. (default: png)")
+    quality = f"Quality of jpeg and webp, 1 to 100. (default: {DEFAULT_QUALITY})"
+    group.add_argument("--quality", type=int, metavar="NUMBER", help=quality)
+    motion = "EXR and NPY also hold motion vectors, from each frame's time to this much later, in the scene's time."
+    group.add_argument("--dt", type=float, metavar="TIME", help=motion)
+    group.add_argument("--transparent", action="store_true", help="Render images without a background.")
 
 
 def _run(options: argparse.Namespace) -> None:

@@ -10,13 +10,13 @@ import tyro
 from msdgs_serve.scene.errors import InvalidInput
 
 
-def optional(metavar: str) -> Any:
+def optional(metavar: str, aliases: list[str] | None = None) -> Any:
     """How the help shows an option that may be left out, and whose text says what happens then: without `None`."""
 
     def shown(default: str) -> str:
         return "" if default == "None" else f"(default: {default})"
 
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=shown)
+    return tyro.conf.arg(metavar=metavar, aliases=aliases, help_behavior_hint=shown)
 
 
 class Checked:

@@ -30,6 +30,7 @@ COMMON = {
 """Settings that --help shows, by group; --help-all shows all."""
 RARE = ("viewer_port", "viewer_host")
 """Options of the command that only --help-all shows."""
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,11 @@ class Fit:
     """The folder of the run: new, or one to --resume."""
     preset: Annotated[str, tyro.conf.arg(metavar="NAME")] = DEFAULT
     """System and settings; other options change them."""
-    resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    resume: Flag = False
     """Continue the run in RUN with its own settings."""
-    tensorboard: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    tensorboard: Flag = False
     """Also write events to RUN/tensorboard; needs msdgs[tensorboard]."""
-    viewer: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    viewer: Flag = False
     """Show the model in a browser while it trains, and afterwards until Ctrl-C; needs msdgs[viewer]."""
     viewer_port: int = 8080
     """Port of the viewer; the next free one if it is taken, any free one if 0."""

@@ -45,6 +45,7 @@ STATIONARY = ["--static-fraction=0", "--window-full-fraction=0"]
         ("view --help", "MODEL --port after|each|layer msdgs[viewer]"),
         ("eval --help", "RUN DATA --split LPIPS moving contact|sheet"),
         ("steps --help", "MODEL --t --out --size --camera layers nearest|in|time"),
+        ("compare --help", "SYSTEM... DATA... --minutes|MINUTES mine.toml"),
     ],
 )
 def test_the_help_has_examples(command: str, words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -54,6 +55,7 @@ def test_the_help_has_examples(command: str, words: str, capsys: pytest.CaptureF
     shown = " ".join(capsys.readouterr().out.split())
     for word in words.split():
         assert word.replace("|", " ") in shown
+    assert not [word for word in ("None", "null", "factory", "(default: )") if word in shown]
 
 
 def test_every_preset_has_settings_of_its_own_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
