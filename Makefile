@@ -7,12 +7,17 @@ SCENE ?= examples/toys.onnx
 PORT ?= 8000
 ONCE ?=
 ARGS ?=
+CASES ?= 1000
+SEED := $(shell date +%s)
 
 SERVE := .venv-serve
 FULL := .venv
 CLUSTER := .venv-cluster
 VIEWER := .venv-viewer
 HTTP_TESTS := tests/service tests/frames/test_video.py --ignore-glob='*/test_viewer*'
+FUZZERS := tests/service/test_openapi.py tests/service/test_hostile_uploads.py tests/scene/test_structured_fuzz.py \
+	tests/export/test_importers_damaged.py tests/export/test_work_precision.py tests/frames/test_blocks.py \
+	tests/rasterizer/test_rasterizer_stress.py
 BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.avx512 service.scaling \
 	training.training_step training.known_motion training.k_steps export.imported_formats export.paper_sized \
 	export.nodes export.scene_file
@@ -25,7 +30,7 @@ DEMO_FLAGS = --port $(PORT) $(if $(filter-out 0,$(ONCE)),--once)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo demo-train test fast test-fast test-cluster test-viewer bench-check lint format clean
+.PHONY: help demo demo-train test fuzz fast test-fast test-cluster test-viewer bench-check lint format clean
 
 help:  ## show this list
 	@awk -F ':.*## +' '/^[a-z-]+:.*##/ { printf "  make %-13s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -40,7 +45,10 @@ demo-train: $(FULL)/.installed-train  ## make a moving scene, train, export, ser
 	$(FULL)/bin/python examples/demo_train.py $(DEMO_FLAGS)
 
 test: lint  ## install everything, check style, types and imports, run the tests
-	$(FULL)/bin/python -m pytest $(ARGS)
+	$(FULL)/bin/python -m pytest --durations 40 $(ARGS)
+
+fuzz: $(FULL)/.installed-dev  ## CASES=1000 new cases of each fuzzer; SEED=N repeats those of a seed
+	MSDGS_FUZZ=$(CASES) MSDGS_FUZZ_SEED=$(SEED) $(FULL)/bin/python -m pytest --hypothesis-seed $(SEED) $(FUZZERS) $(ARGS)
 
 fast: $(FULL)/.installed-dev  ## the same checks and the tests that take less than a second, in a minute
 	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint test-fast

@@ -12,11 +12,17 @@ import hypothesis
 import numpy as np
 import pytest
 
+from tests.support.fuzzing import CASES, IS_FRESH
 from tests.support.scene_files import write_scene
 from tests.support.skips import not_tested, unexpected
 
 hypothesis.settings.register_profile(
-    "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+    "any machine",
+    max_examples=CASES,
+    derandomize=not IS_FRESH,
+    database=None,
+    deadline=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
 )
 hypothesis.settings.load_profile("any machine")
 

@@ -1,10 +1,8 @@
 """Damaged files of every imported kind are refused or rendered finite, in bounded time and memory.
 
-`MSDGS_DAMAGED=5000 pytest -n 0 -s tests/export/test_importers_damaged.py` tests 5,000 larger files of each
-kind, and 500 of each kind of run.
+Of each kind of run, whose networks are read in a process that first loads torch, a tenth as many are tested.
 """
 
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +24,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model_file import CheckpointInvalid, load_model, save_model
 from tests.support.foreign_runs import deformgs_state, fourdgs_state, write_deformgs, write_fourdgs
+from tests.support.fuzzing import CASES, IS_FRESH, SEED
 from tests.support.memory import measured
 from tests.support.models import SCENE, random_model
 from tests.support.splat_files import FORMATS, drawn, sog_bytes, some_gaussians, write_sog, write_splats
@@ -33,10 +32,7 @@ from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
 QUIET = Console(quiet=True)
-DAMAGED = int(os.environ.get("MSDGS_DAMAGED", "20"))
-"""Damaged files of each kind; a tenth of them of runs, whose networks are read in a process that first loads torch."""
-
-COUNT = 300 if DAMAGED < 1000 else 1_000
+COUNT = 1_000 if IS_FRESH else 300
 """Gaussians in a file."""
 
 PALETTE = 64
@@ -122,11 +118,11 @@ KINDS = {
 
 @pytest.mark.parametrize("name", KINDS)
 def test_damaged_files_are_refused_or_drawn(tmp_path: Path, name: str):
-    kind, rng = KINDS[name], np.random.default_rng(sum(name.encode()))
+    kind, rng = KINDS[name], np.random.default_rng(SEED + sum(name.encode()))
     files = kind.make(tmp_path, some_gaussians(COUNT, sh_degree=1))
     whole = {file: file.read_bytes() for file in files}
     drawn(kind.read(tmp_path, files))  # compiles
-    count, sound_reads = (max(DAMAGED // 10, len(files)), 1) if name in RUNS else (DAMAGED, 3)
+    count, sound_reads = (max(CASES // 10, len(files)), 1) if name in RUNS else (CASES, 3)
     sound = max(measured(lambda: kind.read(tmp_path, files))[1] for _ in range(sound_reads))
     worst, slowest, refused = 0.0, 0.0, 0
     for i in range(count):

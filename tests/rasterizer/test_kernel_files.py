@@ -3,10 +3,13 @@
 import ast
 import json
 import shutil
+import sys
 from collections.abc import Callable
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 import pytest
+from numba.core import config
 
 from msdgs_serve.api.cli import main
 from msdgs_serve.process import EXIT_INVALID
@@ -39,12 +42,25 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def compiled(folder: Path) -> Path:
-    """Return a cache that one process has filled and another one has used."""
-    assert call(folder, folder / "cache") == (42.0, True)
-    assert call(folder, folder / "cache") == (42.0, False)
-    return folder / "cache"
+@pytest.fixture
+def compiled(folder: Path, tmp_path: Path) -> Path:
+    """Return a cache that has been filled and used."""
+    assert imported_and_called(folder, tmp_path / "cache") == (42.0, True)
+    assert imported_and_called(folder, tmp_path / "cache") == (42.0, False)
+    return tmp_path / "cache"
+
+
+def imported_and_called(folder: Path, cache: Path) -> tuple[float, bool]:
+    """Return the result of the kernel, imported anew, and whether it was compiled."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(config, "CACHE_DIR", str(cache))
+        spec = spec_from_file_location("caller", folder / "package" / "caller.py")
+        assert spec
+        assert spec.loader
+        module = module_from_spec(spec)
+        patch.setitem(sys.modules, "caller", module)
+        spec.loader.exec_module(module)
+        return module.double(21.0), bool(module.double.stats.cache_misses)
 
 
 def call(folder: Path, cache: Path | str) -> tuple[float, bool]:
@@ -62,21 +78,18 @@ def flip(contents: bytes) -> bytes:
     return contents[:middle] + bytes([contents[middle] ^ 1]) + contents[middle + 1 :]
 
 
-@pytest.mark.xdist_group("kernel files")  # one worker, so that the folder is compiled once
 @pytest.mark.parametrize(
     ("suffix", "damage"),
     [(".nbi", cut), (".nbc", flip), (".nbc", None)],
     ids=["index cut", "code flipped", "code missing"],
 )
 def test_a_damaged_file_is_compiled_again_and_replaced(
-    folder: Path, compiled: Path, tmp_path: Path, suffix: str, damage: Callable[[bytes], bytes] | None
+    folder: Path, compiled: Path, suffix: str, damage: Callable[[bytes], bytes] | None
 ):
-    cache = tmp_path / "cache"
-    shutil.copytree(compiled, cache)
-    (file,) = cache.rglob(f"*.double-*{suffix}")
+    (file,) = compiled.rglob(f"*.double-*{suffix}")
     file.write_bytes(damage(file.read_bytes())) if damage else file.unlink()
-    assert call(folder, cache) == (42.0, True)
-    assert call(folder, cache) == (42.0, False)
+    assert imported_and_called(folder, compiled) == (42.0, True)
+    assert imported_and_called(folder, compiled) == (42.0, False)
 
 
 def test_a_folder_that_cannot_be_written_is_no_obstacle(folder: Path, tmp_path: Path):

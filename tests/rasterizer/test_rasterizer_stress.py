@@ -1,7 +1,6 @@
-"""Sixteen threads that draw frames of different sizes at once, for some seconds or for `MSDGS_STRESS_SECONDS`."""
+"""Sixteen threads that draw frames of different sizes at once, for a second or with `make fuzz` for longer."""
 
 import multiprocessing
-import os
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import rasterize
+from tests.support.fuzzing import CASES
 from tests.support.memory import STATUS, resident_megabytes
 from tests.support.scenes import Scene, as_dtype, random_scene
 from tests.support.tolerances import tolerance
@@ -16,7 +16,7 @@ from tests.support.tolerances import tolerance
 pytestmark = pytest.mark.slow
 
 THREADS = 16
-SECONDS = float(os.environ.get("MSDGS_STRESS_SECONDS", "3"))
+SECONDS = CASES / 20
 SIZES = ((1, 1), (16, 16), (53, 37), (300, 200), (17, 400), (640, 480), (128, 129), (1000, 40))
 
 

@@ -16,12 +16,15 @@ from msdgs_serve.scene import SceneFileInvalid
 from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.trial import try_scene
 from tests.support.fuzz_scenes import hostile_file
+from tests.support.fuzzing import CASES, SEED
 from tests.support.hostile_scenes import ATTACKS, POISON, Attack, poisoned
 from tests.support.processes import run_python
 from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, check_problem, eventually, in_this_process, serving
+from tests.support.sound_scenes import sound_scenes
 
-MUTATED = 8
+MUTATED = 2 * CASES // 5
+"""Each is opened in a process of its own."""
 
 
 def frame(client: httpx.Client) -> bytes:
@@ -101,11 +104,12 @@ def test_poisoned_files_are_listed_as_broken_and_nothing_else_changes(tmp_path: 
 @pytest.mark.xdist_group("sound scenes")  # one worker makes them
 def test_mutated_files_are_refused_or_served_without_a_server_error(folder: Path):
     write_scene(folder / "good.onnx")
+    scenes = sound_scenes()
     with serving(folder, uploads=True) as client:
         before = frame(client)
-        for seed in range(MUTATED):
+        for seed in range(SEED, SEED + MUTATED):
             query = {"name": "mutated", "replace": "true"}
-            answer = client.post("/scenes", params=query, content=hostile_file(seed))
+            answer = client.post("/scenes", params=query, content=hostile_file(scenes, seed))
             assert answer.status_code in (201, 422), (seed, answer.text)
             for t in (0, 0.37, 1) if answer.status_code == 201 else ():
                 drawn = client.post("/render", json={**FRAME, "scene": "mutated", "t": t})

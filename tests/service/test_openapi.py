@@ -1,12 +1,10 @@
 """The OpenAPI document tested against the service: by schemathesis, random bytes, and single wrong values in bodies,
 queries and headers.
 
-The document allows every response, 5xx are 501, 503, 504 or 507, and the service keeps running. Cases are drawn with a
-seed; `MSDGS_FUZZ=100000 pytest -n 0 tests/service/test_openapi.py` sets their number in each test.
+The document allows every response, 5xx are 501, 503, 504 or 507, and the service keeps running.
 """
 
 import json
-import os
 import random
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,15 +17,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
+from tests.support.fuzzing import CASES, SEED
 from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, MAX_SECONDS, ORBIT, check_problem, serving
 
-CASES = int(os.environ.get("MSDGS_FUZZ", "200"))
-SEEDED: dict[str, Any] = {
-    "database": None,
-    "derandomize": True,
-    "suppress_health_check": [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.function_scoped_fixture],
-}
+HEALTHY = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.function_scoped_fixture]
 ALLOWED = {501, 503, 504, 507}
 JSON = {"Content-Type": "application/json"}
 HUGE, DEEP, DEEPER = "@huge@", "@deep@", "@deeper@"
@@ -126,7 +120,7 @@ def test_every_call_answers_as_the_document_says(client: httpx.Client):
     assert len(every) == 12
     for operation in every:
 
-        @settings(max_examples=-(-CASES // len(every)), **SEEDED)
+        @settings(suppress_health_check=HEALTHY)
         @given(case=operation.as_strategy())
         def check(case: schemathesis.Case) -> None:
             # JSON Schema can't express times and cameras of a scene, nor combinations of fields
@@ -136,7 +130,7 @@ def test_every_call_answers_as_the_document_says(client: httpx.Client):
 
 
 @pytest.mark.slow
-@settings(max_examples=CASES, **SEEDED)
+@settings(suppress_health_check=HEALTHY)
 @given(content=st.binary(max_size=300))
 def test_random_bytes_are_refused(client: httpx.Client, content: bytes):
     response = client.post("/render", content=content, headers=JSON)
@@ -210,7 +204,7 @@ def bodies(document: Document) -> list[tuple[str, Any, Leaf]]:
 
 
 def chosen(cases: list[Any]) -> list[Any]:
-    return random.Random(0).sample(cases, min(CASES, len(cases)))
+    return random.Random(SEED).sample(cases, min(CASES, len(cases)))
 
 
 def text_of(body: Any, *, twice: bool) -> bytes:

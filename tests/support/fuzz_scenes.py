@@ -1,10 +1,12 @@
-"""Mutated scene files by seed, opened, posed and rendered. As a program it opens MARKER, then tests COUNT files.
+"""Mutated scene files by seed, opened, posed and rendered. As a program it renders the valid scenes of FOLDER, opens
+MARKER, then tests FILES mutated ones.
 
-`python -m tests.support.fuzz_scenes COUNT MARKER`
+`python -m tests.support.fuzz_scenes FOLDER MARKER`
 """
 
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,19 +16,19 @@ from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import Camera, SceneFileInvalid
 from msdgs_serve.scene.camera import orbit
 from msdgs_serve.scene.onnx import GraphLimits
+from tests.support.fuzzing import CASES, SEED
 from tests.support.scene_files import UP
 from tests.support.scene_mutations import mutated
-from tests.support.sound_scenes import sound_scenes
 
+FILES = 5 * CASES
 LIMITS = GraphLimits(memory_bytes=64 << 20, operations=1e10, call_operations=1e10)
 CAMERA = Camera.from_fov(orbit(np.zeros(3), 5.0, 30, 20, UP), 16, 16, 40.0)
 DRAWN = "drawn"
 
 
-def hostile_file(seed: int) -> bytes:
-    """Return the mutated file of a seed."""
+def hostile_file(scenes: Mapping[str, bytes], seed: int) -> bytes:
+    """Return the mutated file of a seed, made of one of these valid scenes."""
     rng = np.random.default_rng([33, seed])
-    scenes = sound_scenes()
     names = sorted(scenes)
     return mutated(scenes[names[seed % len(names)]], rng)
 
@@ -54,23 +56,24 @@ def reason(error: SceneFileInvalid) -> str:
     return error.problem
 
 
-def outcomes(seeds: range) -> Counter[str]:
-    """Count the outcomes of the files of some seeds; a failure names its seed."""
+def outcomes(scenes: Mapping[str, bytes]) -> Counter[str]:
+    """Count the outcomes of `FILES` mutated files; a failure names its seed."""
     counted: Counter[str] = Counter()
-    for seed in seeds:
+    for seed in range(SEED, SEED + FILES):
         try:
-            counted[outcome(hostile_file(seed))] += 1
+            counted[outcome(hostile_file(scenes, seed))] += 1
         except Exception as error:
             raise AssertionError(f"the file of seed {seed} is neither refused nor drawn") from error
     return counted
 
 
-def main(count: str, marker: str) -> None:
+def main(folder: str, marker: str) -> None:
     """Render the valid files, open the marker, then test the mutated files."""
-    for contents in sound_scenes().values():
+    scenes = {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+    for contents in scenes.values():
         assert outcome(contents) == DRAWN
     Path(marker).read_bytes()
-    print(f"{outcomes(range(int(count)))[DRAWN]} drawn")
+    print(f"{outcomes(scenes)[DRAWN]} drawn")
 
 
 if __name__ == "__main__":
