@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 from composition import DOCKER, ROOT, Composition, Response, containers, expect, frame, get, log, output, post
@@ -102,15 +103,14 @@ def under_load(url: str, change: Callable[[], object]) -> Load:
                 if response.status != 200:
                     failed.append(f"{response.status} {response.body[:200].decode(errors='replace')}")
 
-    clients = [threading.Thread(target=client) for _ in range(CLIENTS)]
+    with ThreadPoolExecutor(CLIENTS) as pool:
+        clients = [pool.submit(client) for _ in range(CLIENTS)]
+        try:
+            time.sleep(1)
+            change()
+            time.sleep(SETTLED_SECONDS)
+        finally:
+            ended.set()
     for each in clients:
-        each.start()
-    try:
-        time.sleep(1)
-        change()
-        time.sleep(SETTLED_SECONDS)
-    finally:
-        ended.set()
-        for each in clients:
-            each.join()
+        each.result()  # a client that broke off has failed
     return Load(failed, seconds)

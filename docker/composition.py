@@ -11,6 +11,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from email.message import Message
+from http.client import HTTPException
 from pathlib import Path
 from typing import NamedTuple
 
@@ -115,19 +116,21 @@ def video(url: str, file_format: str) -> Response:
 
 
 def get(url: str, headers: dict[str, str] | None = None) -> Response:
-    """Return status and body of a GET; status 0 without a response."""
+    """Return status and body of a GET; status 0 without a complete response."""
     return ask(urllib.request.Request(url, headers=headers or {}))
 
 
 def ask(request: urllib.request.Request) -> Response:
-    """Return status and body of a request; status 0 without a response."""
+    """Return status and body of a request; status 0 without a complete response."""
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
-        with direct.open(request, timeout=60) as response:
+        try:
+            response = direct.open(request, timeout=60)
+        except urllib.error.HTTPError as error:
+            response = error
+        with response:
             return Response(response.status, response.headers, response.read())
-    except urllib.error.HTTPError as error:
-        return Response(error.code, error.headers, error.read())
-    except OSError:
+    except (OSError, HTTPException):
         return Response(0, Message(), b"")
 
 
