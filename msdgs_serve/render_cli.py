@@ -95,7 +95,9 @@ def _add_path_options(group: argparse._ArgumentGroup) -> None:
 def _add_output_options(group: argparse._ArgumentGroup) -> None:
     fps = f"Frames per second of a video; by default the path's, else {DEFAULT_FPS:g}."
     group.add_argument("--fps", type=float, help=fps)
-    group.add_argument("--format", choices=get_args(ImageFormat), default="png", help="Format of images. (default: png)")
+    group.add_argument(
+        "--format", choices=get_args(ImageFormat), default="png", help="Format of images. (default: png)"
+    )
     quality = f"Quality of jpeg and webp, 1 to 100. (default: {DEFAULT_QUALITY})"
     group.add_argument("--quality", type=int, metavar="NUMBER", help=quality)
     motion = "EXR and NPY also hold motion vectors, from each frame's time to this much later, in the scene's time."
