@@ -1,1 +1,1 @@
-"""Training: `training_step`, `known_motion`, `k_steps`, and systems for `msdgs-train compare`."""
+"""Training: `training_step`, `known_motion`, `k_steps`, and systems and scenes for `msdgs-train compare`."""

@@ -16,10 +16,12 @@ from rich.console import Console
 from benchmarks.measuring import report_console, table
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli.compare import comparison_progress
-from msdgs_train.comparison.bench import Row, make_bench_runs, read_scenes, rows_of, runs_left, train_and_measure
-from msdgs_train.comparison.bench_report import gain, machines_of, values_of
-from msdgs_train.comparison.matrix import Budget
-from msdgs_train.comparison.report import mean_and_deviation, save_figure
+from msdgs_train.comparison.gains import gain, machines_of, mean_and_deviation, values_of
+from msdgs_train.comparison.matrix import Budget, make_runs
+from msdgs_train.comparison.pools import processes
+from msdgs_train.comparison.report import save_figure
+from msdgs_train.comparison.rows import Row, rows_of, runs_left, train_and_measure
+from msdgs_train.comparison.scenes import read_scenes
 from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
 from msdgs_train.layers.base import PAPER_HEADS
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
@@ -37,7 +39,6 @@ OVER_ONE = f"of {CHAIN} over one of them"
 
 
 def main(
-    data: Path = Path("data"),
     out: Path = Path("out/k_steps"),
     csv: Path | None = None,
     scenes: tuple[str, ...] = SCENES,
@@ -50,17 +51,16 @@ def main(
     """Train K = 1, 2, 4 and 10 layers, and one layer of as many parameters as each, with and without step weights and
     modulation; print a table and draw PSNR on test images against K.
 
-    python -m benchmarks.training.k_steps --data data --csv docs/data/k_steps.csv
+    python -m benchmarks.training.k_steps --csv docs/data/k_steps.csv
 
     Each run has one thread. The bits of a run of a number of steps don't depend on what else the machine does. With
     `--minutes` the runs are of equal time, and only the K layers themselves are trained: whether more of them pay
     although each step takes longer. Runs that have a row in the file are not trained again.
 
     Args:
-        data: The folder that holds the datasets of `msdgs-train bench`.
         out: The folder of runs, table and figure.
         csv: The file with a row per finished run; OUT/k_steps.csv if not given.
-        scenes: Scenes of k_steps.toml, which are 100 pixels wide.
+        scenes: Scenes of k_steps.toml, which are 100 pixels wide, of datasets in `data/`.
         seeds: One run per seed.
         steps: Optimizer steps of each run; 2,500 without minutes.
         minutes: CPU time of each run, instead of steps.
@@ -71,14 +71,15 @@ def main(
         return self_test()
     csv = csv or out / "k_steps.csv"
     try:
-        found = read_scenes(data, short=False, names=scenes, file=SCENES_FILE)
+        found = read_scenes([SCENES_FILE], scenes)
         if steps is None and minutes is None:
             steps = STEPS
-        budget = Budget(steps, minutes, time="cpu").settings() | {"eval_every": 0}
+        budget = Budget(steps, minutes, time="cpu")
         families = FAMILIES if minutes is None else (CHAIN,)
-        runs = make_bench_runs({name: c.updated(**budget) for name, c in systems(families).items()}, found, seeds, out)
+        configs = {name: budget.of(config).updated(eval_every=0) for name, config in systems(families).items()}
+        runs = make_runs(configs, found, seeds, out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
-            complete = train_and_measure(runs, found, csv, jobs, on_end)
+            complete = train_and_measure(runs, csv, processes(jobs), on_end)
     except InvalidInput as error:
         report_console().print(f"error: {error}", style="red", markup=False)
         return 1

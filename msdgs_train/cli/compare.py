@@ -11,8 +11,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, Time
 
 from msdgs_serve.process import EXIT_INTERRUPTED
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli.console import EXIT_INVALID, console, progress_bar, rich_table
+from msdgs_train.cli.console import EXIT_INVALID, console, progress_bar
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
+from msdgs_train.comparison.scenes import read_scenes
 from msdgs_train.settings import optional
 
 if TYPE_CHECKING:
@@ -23,11 +24,14 @@ ONE_OR_MORE_SYSTEMS = tyro.conf.arg(metavar="SYSTEM...", help_behavior_hint="(on
 
 @dataclass(frozen=True)
 class Compare:
-    """Train every system on every scene with every seed under one budget, and compare them: a table (comparison.md),
-    all numbers (comparison.json), error against training time (time.png) and against the number of layers (layers.png).
+    """Train every system on every scene with every seed under one budget, and compare them: tables with gains over the
+    first system (comparison.md), all numbers (comparison.json), error against training time (time.png) and against the
+    number of layers (layers.png).
 
-    A system is a preset, or a table of a TOML file: a `preset` and settings of `fit` that replace its own. The same
-    command continues after Ctrl-C; finished runs aren't trained again.
+    A system is a preset, or a table of a TOML file: a `preset` and settings of `fit` that replace its own. A scene is a
+    dataset folder, or a table of a TOML file: a `folder` relative to the file, and if needed `size`, `llffhold`,
+    `time_from` and the `splits` that are reported. Each finished run adds a row to a CSV file, and runs that have a row
+    aren't trained again, so that the same command continues after Ctrl-C.
 
     Example:  msdgs-train compare deformgs 4dgs mine.toml --data data/a data/b --out runs/all --steps 3000 --size 200
     --init-num-pts 5000 --max-gaussians 10000
@@ -38,9 +42,13 @@ class Compare:
     systems: Annotated[tuple[str, ...], tyro.conf.Positional, ONE_OR_MORE_SYSTEMS]
     """Names of presets, and TOML files."""
     data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DATA...")]
-    """Dataset folders, one or more."""
+    """Dataset folders and TOML files of scenes, one or more."""
     out: Path
     """The folder of all runs and results: new, or one of the same comparison."""
+    csv: Annotated[Path | None, optional("PATH")] = None
+    """The file with a row per finished run; OUT/comparison.csv if not given."""
+    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...", help_behavior_hint="")] = ()
+    """Names of the scenes to train on; all if not given."""
     seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT...")] = (0, 1, 2)
     """One run per seed; the table shows mean and standard deviation."""
     budget: Annotated[Budget, tyro.conf.arg(name="")] = field(default_factory=Budget)
@@ -54,36 +62,29 @@ class Compare:
     def execute(self) -> int:
         from msdgs_serve.threads import thread_count
         from msdgs_train.comparison.pools import processes, ray_tasks
-        from msdgs_train.comparison.report import HEADINGS, table, write_comparison
+        from msdgs_train.comparison.report import write_comparison
         from msdgs_train.comparison.results import collect
-        from msdgs_train.comparison.runner import train_all
+        from msdgs_train.comparison.rows import rows_of, runs_left, train_and_measure
 
-        check_jobs(self.jobs)
-        runs = make_runs(read_systems(self.systems, self.budget), self.data, self.seeds, self.out)
+        if self.jobs is not None and self.jobs < 1:
+            raise InvalidInput("jobs", "1 or more", self.jobs)
+        csv, systems = self.csv or self.out / "comparison.csv", read_systems(self.systems, self.budget)
+        runs = make_runs(systems, read_scenes(self.data, self.scenes), self.seeds, self.out)
         if self.ray is None:
             pool = processes(self.jobs or max(1, thread_count() // self.budget.threads))
         else:
             pool = ray_tasks(self.ray, self.budget.threads, self.jobs)
-        with comparison_progress(len(runs)) as on_end:
-            complete = train_all(runs, pool, on_end)
-        results = collect(runs)
-        if results:
-            paths = write_comparison(self.out, results, len(runs) - len(results))
-            if console.is_terminal:
-                console.print(rich_table(HEADINGS, table(results), names=2))
-            else:  # the table is wider than 80 columns
-                console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, highlight=False)
-            console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
+        with comparison_progress(len(runs_left(runs, csv))) as on_end:
+            complete = train_and_measure(runs, csv, pool, on_end)
+        rows = rows_of(runs, csv)
+        if rows:
+            paths = write_comparison(self.out, collect(runs), rows, list(systems), len(runs) - len(rows))
+            console.print(paths[0].read_text(encoding="utf-8"), soft_wrap=True, highlight=False)
+            console.print("wrote " + ", ".join(map(str, [csv, *paths])), soft_wrap=True)
         if not complete:
             console.print("interrupted; the same command continues", soft_wrap=True)
             return EXIT_INTERRUPTED
-        return 0 if len(results) == len(runs) else EXIT_INVALID
-
-
-def check_jobs(jobs: int | None) -> None:
-    """Raise `InvalidInput` if `jobs` is below 1."""
-    if jobs is not None and jobs < 1:
-        raise InvalidInput("jobs", "1 or more", jobs)
+        return 0 if len(rows) == len(runs) else EXIT_INVALID
 
 
 @contextmanager

@@ -1,34 +1,37 @@
 """The runs of a comparison: systems × scenes × seeds, each with its settings and its folder."""
 
-import re
-import tomllib
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.comparison.scenes import SPLITS, Scene
+from msdgs_train.comparison.tables import read_tables, require_unique
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.settings import optional
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
 EVALUATIONS = 10  # number of evaluations of held-out images during training
 LOG_LINES = 100
+DEFAULT_STEPS = 3000
 
 
 @dataclass(frozen=True)
 class Budget:
     """Settings that all systems share; None keeps the system's own."""
 
-    steps: Annotated[int | None, optional("INT")] = 3000
-    """Optimizer steps of each run, instead of the preset's. All schedules are fractions of a run and scale with it."""
+    steps: Annotated[int | None, optional("INT")] = None
+    """Optimizer steps of each run, instead of the preset's; 3,000 without --minutes. All schedules are fractions of a
+    run and scale with it."""
     minutes: Annotated[float | None, optional("MINUTES")] = None
-    """Length of each run, counted as --time says, instead of --steps."""
+    """Length of each run, counted as --time says; --steps or the preset's steps are then those of its schedule."""
     size: Annotated[int | None, optional("PIXELS")] = None
-    """Width of all images in pixels, height in proportion; their own if not given."""
+    """Width of all images in pixels, except of scenes that have their own."""
     time_from: Annotated[str | None, optional("{names,index,none,REGEX}")] = None
-    """Times of all images, as in `msdgs-train fit --help`; the datasets' own if not given."""
+    """Where the times of all images come from, as in `fit`, except of scenes that have their own."""
     init_num_pts: Annotated[int | None, optional("INT")] = None
     """Initial Gaussians of all systems; their own settings if not given."""
     max_gaussians: Annotated[int | None, optional("INT")] = None
@@ -38,14 +41,15 @@ class Budget:
     time: Literal["wall", "cpu"] = "wall"
     """What --minutes counts: time that passes, or CPU time of all threads of a run."""
 
-    def settings(self) -> dict[str, Any]:
-        """Return the settings of `TrainConfig`."""
-        given = {"minutes": self.minutes, "threads": self.threads, "time": self.time, "eval_every": 0}
-        if self.steps is not None:
-            every = max(self.steps // EVALUATIONS, 1)
-            given |= {"eval_every": every, "checkpoint_every": every, "log_every": max(self.steps // LOG_LINES, 1)}
-        shared = {name: getattr(self, name) for name in ("steps", "size", "time_from", "init_num_pts", "max_gaussians")}
-        return given | {name: value for name, value in shared.items() if value is not None}
+    def of(self, config: TrainConfig) -> TrainConfig:
+        """Return the settings of a system under this budget."""
+        steps = DEFAULT_STEPS if self.steps is None and self.minutes is None else self.steps
+        shared = {name: getattr(self, name) for name in ("size", "time_from", "init_num_pts", "max_gaussians")}
+        given = {name: value for name, value in {"steps": steps, **shared}.items() if value is not None}
+        config = config.updated(minutes=self.minutes, threads=self.threads, time=self.time, **given)
+        every = max(config.run.steps // EVALUATIONS, 1)
+        logged = max(config.run.steps // LOG_LINES, 1)
+        return config.updated(eval_every=every, checkpoint_every=every, log_every=logged)
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,10 @@ class Run:
     data: Path
     folder: Path
     config: TrainConfig
+    settings: str
+    """Eight digits that change with any setting of the system and the command besides the budget's time and threads."""
+    splits: tuple[str, ...] = SPLITS
+    """Held-out images whose metrics are reported."""
 
     @property
     def name(self) -> str:
@@ -76,17 +84,24 @@ def read_systems(sources: Sequence[str], budget: Budget) -> dict[str, TrainConfi
     return dict(configs)
 
 
-def make_runs(systems: Mapping[str, TrainConfig], scenes: Sequence[Path], seeds: Sequence[int], out: Path) -> list[Run]:
+def make_runs(
+    systems: Mapping[str, TrainConfig], scenes: Sequence[Scene], seeds: Sequence[int], out: Path
+) -> list[Run]:
     """Return one run per system, scene and seed, ordered by seed: if the comparison is stopped early, it has results of
     every system."""
-    require_unique("scene", (scene.resolve().name for scene in scenes))
     require_unique("seed", map(str, seeds))
     return [
-        Run(name, data.name, seed, data, out / name / f"{data.name}_{seed}", config.updated(seed=seed))
+        Run(name, scene.name, seed, scene.folder, out / name / f"{scene.name}_{seed}",
+            config.updated(seed=seed, **scene.settings), _digest(config), scene.splits)
         for seed in seeds
-        for data in map(Path.resolve, scenes)
+        for scene in scenes
         for name, config in systems.items()
-    ]
+    ]  # fmt: skip
+
+
+def _digest(config: TrainConfig) -> str:
+    same = config.updated(seed=0, minutes=None, threads=1, time="wall")
+    return hashlib.sha256(json.dumps(same.to_dict(), sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
@@ -95,31 +110,12 @@ def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
     path = Path(source)
     if path.suffix != ".toml":
         raise InvalidInput("config", f"a preset ({', '.join(systems())}) or a .toml file", source)
-    try:
-        contents = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InvalidInput("config", "a readable file", f"{path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InvalidInput("config", "a TOML file", f"{path}: {error}") from error
-    for name, table in contents.items():
-        if not isinstance(table, dict) or not re.fullmatch(r"\w[\w .+=-]*", name):
-            raise InvalidInput("config", "tables named with letters, digits, spaces and .+=-", f"{path}: `{name}`")
-    return list(contents.items())
+    return list(read_tables("config", path).items())
 
 
 def _config(name: str, table: Mapping[str, Any], budget: Budget) -> TrainConfig:
     changes = {key: value for key, value in table.items() if key != "preset"}
     try:
-        return preset(table.get("preset", DEFAULT)).updated(**changes | budget.settings())
+        return budget.of(preset(table.get("preset", DEFAULT)).updated(**changes))
     except (InvalidInput, TypeError, ValueError) as error:
         raise InvalidInput("config", "made of valid settings", f"system `{name}`: {error}") from error
-
-
-def require_unique(kind: str, given: Iterable[str]) -> None:
-    """Raise `InvalidInput` if no name is given, or one twice."""
-    names = list(given)
-    if not names:
-        raise InvalidInput(kind, "given, one or more", "none")
-    name, count = Counter(names).most_common(1)[0]
-    if count > 1:
-        raise InvalidInput(kind, "named once", f"`{name}` twice")

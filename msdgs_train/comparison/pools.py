@@ -8,7 +8,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -23,7 +23,7 @@ from msdgs_serve.threads import THREADS_VARIABLE
 from msdgs_serve.writing import in_words
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.engine.observer import Observer
-from msdgs_train.engine.run import EVAL_SPLITS, fit
+from msdgs_train.engine.run import fit
 from msdgs_train.engine.run_record import CONFIG
 from msdgs_train.engine.trainer import Trainer
 
@@ -131,13 +131,14 @@ class _Flag:
 
 
 class _ComparisonObserver(Observer):
-    """Stops a run when `is_stopped`, called every `POLL_SECONDS`, returns true; refuses one that can't be evaluated."""
+    """Stops a run when `is_stopped`, called every `POLL_SECONDS`, returns true; refuses one without images of the
+    `splits`, which can't be evaluated."""
 
-    def __init__(self, is_stopped: Callable[[], bool]) -> None:
-        self._is_stopped, self._called = is_stopped, 0.0
+    def __init__(self, is_stopped: Callable[[], bool], splits: Sequence[str]) -> None:
+        self._is_stopped, self._splits, self._called = is_stopped, splits, 0.0
 
     def on_train_start(self, trainer: Trainer) -> None:
-        if not any(trainer.scene.splits.get(split) for split in EVAL_SPLITS):
+        if not any(trainer.scene.splits.get(split) for split in self._splits):
             raise InvalidInput("data", "a dataset with held-out images, or split by llffhold", "training images alone")
 
     def should_stop(self) -> bool:
@@ -171,9 +172,9 @@ def _is_orphan() -> bool:
 def _train(run: Run, is_stopped: Callable[[], bool]) -> RunEnd:
     """Train one run, from its checkpoint if there is one, until `is_stopped`."""
     os.environ[THREADS_VARIABLE] = str(run.config.run.threads)
-    resume = (run.folder / CONFIG).exists()
+    resume, observer = (run.folder / CONFIG).exists(), _ComparisonObserver(is_stopped, run.splits)
     try:
-        result = fit(run.config, run.data, run.folder, resume=resume, observer=_ComparisonObserver(is_stopped))
+        result = fit(run.config, run.data, run.folder, resume=resume, observer=observer)
     except (MsdgsError, OSError) as error:
         return RunEnd("failed", in_words(error))
     except Exception as error:  # of a plugin; other runs continue

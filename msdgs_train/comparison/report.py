@@ -5,7 +5,6 @@ import itertools
 import json
 import os
 import platform
-import statistics
 from collections.abc import Callable, Iterable, Sequence
 from datetime import date
 from operator import attrgetter
@@ -19,7 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from msdgs_serve.writing import replacing, write_text
+from msdgs_train.comparison.gains import mean_and_deviation, scenes_as_markdown
 from msdgs_train.comparison.results import Result
+from msdgs_train.comparison.rows import Row
 from msdgs_train.evaluation.report import markdown_table
 from msdgs_train.layers.parts import to_text
 
@@ -29,17 +30,30 @@ HEADINGS = (
     "training, s", "frame, ms",
 )  # fmt: skip
 BESIDE = 0.04  # horizontal offset between bars of the same K, in layers
+SAME, ROOM = 1.001, 1.1  # ratios of errors
 COLORS, DASHES = [f"C{i}" for i in range(10)], ["-", "--", ":", "-."]
 
 _system = attrgetter("run.system")
 
 
-def write_comparison(out: Path, results: Sequence[Result], missing: int) -> list[Path]:
-    """Write the table, its numbers and the plots into the folder `out`, each atomically; returns their paths.
+def write_comparison(
+    out: Path, results: Sequence[Result], rows: Sequence[Row], systems: Sequence[str], missing: int
+) -> list[Path]:
+    """Write the tables, their numbers and the plots into the folder `out`, each atomically; returns their paths.
 
-    `missing`: number of unfinished runs.
+    Args:
+        results: those of the runs in this folder.
+        rows: those of all finished runs; gains are over the first of the `systems`.
+        missing: number of unfinished runs.
     """
-    write_text(out / TABLE, as_markdown(results, missing))
+    out.mkdir(parents=True, exist_ok=True)
+    text = [as_markdown(results)] if results else []
+    text.append(scenes_as_markdown(rows, systems))
+    if missing:
+        text.append(f"{missing} runs are not finished and are not in the tables.\n")
+    write_text(out / TABLE, "\n".join(text))
+    if not results:
+        return [out / TABLE]
     write_text(out / NUMBERS, json.dumps(as_json(results, missing), indent=2) + "\n")
     save_figure(draw_time(results), out / TIME_PLOT)
     save_figure(draw_layers(results), out / LAYERS_PLOT)
@@ -67,13 +81,7 @@ def _row(group: list[Result]) -> list[str]:
     ]
 
 
-def mean_and_deviation(values: Sequence[float], digits: int) -> str:
-    """Format mean ± sample standard deviation; of a single value only the value."""
-    deviation = f" ± {statistics.stdev(values):,.{digits}f}" if len(values) > 1 else ""
-    return f"{statistics.fmean(values):,.{digits}f}{deviation}"
-
-
-def as_markdown(results: Sequence[Result], missing: int) -> str:
+def as_markdown(results: Sequence[Result]) -> str:
     """Return the table and the conditions of the measurement as Markdown."""
     run = results[0].run.config.run
     kind = "minutes of CPU time" if run.time == "cpu" else "minutes"
@@ -86,8 +94,6 @@ def as_markdown(results: Sequence[Result], missing: int) -> str:
     skipped = sum(result.skipped for result in results)
     if skipped:
         notes.append(f"{skipped} steps were skipped because their loss was not finite.")
-    if missing:
-        notes.append(f"{missing} runs are not finished and are not in the table.")
     return "\n".join([markdown_table(HEADINGS, table(results)), "", *notes]) + "\n"
 
 
@@ -115,7 +121,7 @@ def draw_time(results: Sequence[Result]) -> Figure:
             if len(group) > 1:
                 low, high = errors.min(axis=0), errors.max(axis=0)
                 axes.fill_between(seconds, low, high, color=styles[name]["color"], alpha=0.15, lw=0)
-    return _with_legend(figure)
+    return _completed(figure)
 
 
 def draw_layers(results: Sequence[Result]) -> Figure:
@@ -135,7 +141,7 @@ def draw_layers(results: Sequence[Result]) -> Figure:
             bars = [mean - low, high - mean]
             axes.errorbar(count + offset, mean, bars, marker="o", ms=4, capsize=3, label=name, **styles[key])
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return _with_legend(figure)
+    return _completed(figure)
 
 
 def rms_error(psnr: np.ndarray) -> np.ndarray:
@@ -162,7 +168,13 @@ def _panels(results: Sequence[Result], label: str) -> tuple[Figure, list[tuple[A
     return figure, list(zip(panels, scenes.values(), strict=True))
 
 
-def _with_legend(figure: Figure) -> Figure:
+def _completed(figure: Figure) -> Figure:
+    """Add the legend, and room around errors that are all the same: matplotlib gives a logarithmic axis none."""
+    for axes in figure.axes:
+        low, high = axes.dataLim.intervaly
+        if high < low * SAME:
+            axes.set_autoscaley_on(False)
+            axes.set_ylim(low / ROOM, high * ROOM)
     entries = [axes.get_legend_handles_labels() for axes in figure.axes]
     labelled = {label: handle for handles, labels in entries for handle, label in zip(handles, labels, strict=True)}
     figure.legend(list(labelled.values()), list(labelled), loc="outside right upper", fontsize="small")

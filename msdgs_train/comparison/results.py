@@ -53,7 +53,7 @@ def collect(runs: Sequence[Run]) -> list[Result]:
 
 def _result(run: Run) -> Result:
     metrics = final_metrics(run) or {}
-    split = next(name for name in EVAL_SPLITS if name in metrics["splits"])
+    split = next(name for name in EVAL_SPLITS if name in metrics["splits"] and name in run.splits)
     lines = read_metrics(run.folder)
     loaded = load_model(run.folder / MODEL)
     return Result(

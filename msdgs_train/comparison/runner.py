@@ -69,7 +69,7 @@ def _check_settings(run: Run) -> None:
     has_config, *has_results = ((run.folder / name).exists() for name in (CONFIG, CHECKPOINT, FINAL_METRICS))
     if not (has_config and any(has_results)):
         return
-    changed = [name for name, *_ in differences(read_config(run.folder), run.config) if name != "threads"]
+    changed = [name for name, *_ in differences(read_config(run.folder), run.config)]
     if changed:
         problem = f"{run.folder} with other settings: {', '.join(changed)}"
         raise InvalidInput("out", "a new folder, or one of the same comparison", problem)

@@ -21,9 +21,10 @@ from msdgs_train.cli import main as cli
 from msdgs_train.comparison import pools
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 from msdgs_train.comparison.pools import Processes, RunEnd, processes
-from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, table
+from msdgs_train.comparison.report import BESIDE, as_markdown, draw_layers, draw_time, save_figure, table
 from msdgs_train.comparison.results import CurvePoint, Result
 from msdgs_train.comparison.runner import train_all
+from msdgs_train.comparison.scenes import Scene
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.run import RunResult, fit
 from msdgs_train.layers.mlp import MLPConfig
@@ -62,10 +63,14 @@ def systems_file(tmp_path: Path) -> Path:
     return path
 
 
+def scene(folder: str | Path) -> Scene:
+    return Scene(Path(folder).name, Path(folder), {})
+
+
 def test_a_system_is_a_preset_with_changes_under_the_budget(systems_file: Path) -> None:
     systems = read_systems(["deformgs", str(systems_file)], BUDGET)
     assert list(systems) == ["deformgs", "static", "k1", "k2 w=1"]
-    assert systems["deformgs"] == preset("deformgs").updated(**BUDGET.settings())
+    assert systems["deformgs"] == BUDGET.of(preset("deformgs"))
     assert systems["static"].model.layers == ()
     layers = (MLPConfig(width=16), MLPConfig(width=16, lr_init=1e-3))
     assert systems["k2 w=1"].model == dataclasses.replace(preset("msdgs-small").model, layers=layers, weights=False)
@@ -84,7 +89,7 @@ def test_the_ablation_can_be_compared() -> None:
 
 def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_path: Path) -> None:
     systems = read_systems([str(systems_file)], BUDGET)
-    runs = make_runs(systems, [Path("a/one"), Path("b/two")], [3, 5], tmp_path)
+    runs = make_runs(systems, [scene("a/one"), scene("b/two")], [3, 5], tmp_path)
     assert len({run.folder for run in runs}) == len(runs) == 12
     assert {(run.system, run.scene, run.seed) for run in runs[:6]} == {
         (system, scene, 3) for system in systems for scene in ("one", "two")
@@ -126,17 +131,15 @@ def test_names_may_not_repeat(systems_file: Path, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=r"system.*static"):
         read_systems([str(systems_file), str(systems_file)], BUDGET)
     systems = read_systems(["static"], BUDGET)
-    with pytest.raises(InvalidInput, match=r"scene.*one"):
-        make_runs(systems, [Path("a/one"), Path("b/one")], [0], tmp_path)
     with pytest.raises(InvalidInput, match=r"seed.*none"):
-        make_runs(systems, [Path("a/one")], [], tmp_path)
+        make_runs(systems, [scene("a/one")], [], tmp_path)
     with pytest.raises(InvalidInput, match=r"seed.*twice"):
-        make_runs(systems, [Path("a/one")], [0, 0], tmp_path)
+        make_runs(systems, [scene("a/one")], [0, 0], tmp_path)
 
 
 def made_result(system: str, layers: int, seed: int, psnr: float, kind: str = "mlp") -> Result:
     config = preset("msdgs-small").updated(seed=seed, layers=(kind,) * layers)
-    run = Run(system, "toy", seed, Path("toy"), Path("out") / f"{system}{seed}", config)
+    run = Run(system, "toy", seed, Path("toy"), Path("out") / f"{system}{seed}", config, "digest")
     curve = [CurvePoint(10 * i, i * 1.5, psnr - 3 + i) for i in range(1, 4)]
     return Result(
         run=run, split="test", psnr=psnr, ssim=0.9, deformation_parameters=1000 * layers, gaussians=300,
@@ -158,13 +161,12 @@ def test_the_table_has_a_row_for_each_system_and_scene() -> None:
         "k1", "toy", "2", "21.00 ± 1.41", "0.9000 ± 0.0000", "1,000", "1,050 ± 0", "300 ± 0", "60 ± 0", "4.0 ± 0.0"
     ]  # fmt: skip
     assert [row[0] for row in rows] == ["k1", "k2", "k4"]
-    text = as_markdown(RESULTS, missing=2)
+    text = as_markdown(RESULTS)
     assert "| k2 | toy | 1 | 30.00 | 0.9000 | 2,000 | 2,050 | 300 | 60 | 4.0 |" in text
-    assert "2 runs are not finished" in text
     assert "held-out images of `test`;" in text
     config = RESULTS[0].run.config.updated(minutes=2, time="cpu")
     timed = dataclasses.replace(RESULTS[0], run=dataclasses.replace(RESULTS[0].run, config=config))
-    text = as_markdown([timed, dataclasses.replace(RESULTS[1], split="val")], missing=0)
+    text = as_markdown([timed, dataclasses.replace(RESULTS[1], split="val")])
     assert "2 minutes of CPU time per run" in text
     assert "held-out images of `test` or `val`;" in text
 
@@ -180,6 +182,15 @@ def test_the_plots_show_errors() -> None:
     aside = BESIDE / 2  # bars of the same K don't overlap
     assert [list(x) for x, _ in lines] == [[1 - aside, 2 - aside, 4 - aside], [2 + aside]]
     assert lines[0][1][1] == pytest.approx(10 ** (-30 / 20))
+
+
+@pytest.mark.parametrize("psnr", [20.0, 22.438109931601858, 34.72395823374006])
+def test_a_single_run_can_be_drawn(psnr: float, tmp_path: Path) -> None:
+    result = made_result("one", 1, 0, psnr)
+    result = dataclasses.replace(result, curve=[CurvePoint(1, 2.0, psnr)])
+    for draw in (draw_time, draw_layers):
+        save_figure(draw([result]), tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").stat().st_size > 1000
 
 
 def test_each_scene_has_a_panel_and_each_system_a_style() -> None:
@@ -226,6 +237,9 @@ def test_from_nothing_to_the_table_and_not_again(
         assert (tmp_path / "out" / name).stat().st_size > 100
     assert (tmp_path / "out" / "comparison.md").read_text() in capsys.readouterr().out
     assert cli.main(command) == 0
+    assert "finished" not in capsys.readouterr().out
+    (tmp_path / "out" / "comparison.csv").unlink()  # rows are measured again, and nothing is trained
+    assert cli.main(command) == 0
     assert capsys.readouterr().out.count("was finished") == 6
     for option, message in (("--size=12", "other settings: size"), ("--jobs=0", "`jobs` must be 1 or more")):
         assert cli.main([*command, option]) == cli.EXIT_INVALID
@@ -244,7 +258,7 @@ def test_a_run_that_fails_is_reported_and_the_others_continue(
     monkeypatch.setattr(pools, "fit", fails_once)
     ended: list[tuple[str, RunEnd]] = []
     (write_scene(tmp_path / "unevaluated", train=2, test=0) / "transforms_val.json").unlink()
-    scenes = [tmp_path / "nowhere", tmp_path / "unevaluated"]
+    scenes = [scene(tmp_path / "nowhere"), scene(tmp_path / "unevaluated")]
     runs = make_runs(read_systems([str(systems_file)], BUDGET), scenes, [0], tmp_path / "out")
     assert train_all(runs, processes(1), lambda run, how: ended.append((run.system, how)))
     assert [system for system, _ in ended] == ["static", "k1", "k2 w=1"] * 2
@@ -254,7 +268,7 @@ def test_a_run_that_fails_is_reported_and_the_others_continue(
 
 
 def test_a_killed_process_is_named(tmp_path: Path) -> None:
-    (run,) = make_runs({"mine": preset("static")}, [tmp_path], [0], tmp_path)
+    (run,) = make_runs({"mine": preset("static")}, [scene(tmp_path)], [0], tmp_path)
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, context) as executor:
         pool = Processes(1, executor, context.Event())
@@ -265,7 +279,7 @@ def test_a_killed_process_is_named(tmp_path: Path) -> None:
 
 
 def test_an_error_while_others_train_stops_them(tmp_path: Path) -> None:
-    runs = make_runs({"mine": preset("static")}, [tmp_path], [0], tmp_path / "out")
+    runs = make_runs({"mine": preset("static")}, [scene(tmp_path)], [0], tmp_path / "out")
     pool = MagicMock(jobs=1)
     pool.finished.side_effect = MsdgsError("no more memory")
     pool.__len__.return_value = 1

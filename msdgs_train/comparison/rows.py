@@ -1,18 +1,11 @@
-"""The benchmark of many scenes: its runs, and a row of a CSV file for each finished one.
-
-Settings are chosen by the mean over scenes of PSNR on `val` images; `test` images, which no choice has seen, are
-reported. A run that has a row isn't trained again.
-"""
+"""A row of a CSV file for each finished run of a comparison. A run that has a row isn't trained again."""
 
 import csv
 import fcntl
-import hashlib
 import io
-import json
 import os
-import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from datetime import date
 from pathlib import Path
 
@@ -21,15 +14,13 @@ from llvmlite.binding import get_host_cpu_name
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import write_text
-from msdgs_train.comparison.matrix import Run, require_unique
-from msdgs_train.comparison.pools import RunEnd, processes
+from msdgs_train.comparison.matrix import Run
+from msdgs_train.comparison.pools import Pool, RunEnd
 from msdgs_train.comparison.runner import final_metrics, train_all
-from msdgs_train.engine.config import TrainConfig
+from msdgs_train.comparison.scenes import SPLITS
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.evaluation.evaluate import evaluate_run
 
-SCENES = Path(__file__).with_name("bench.toml")
-SPLITS = ("val", "test")
 KEY = ("scene", "system", "seed", "minutes", "time", "threads", "settings")
 COLUMNS = (
     "date", "machine", *KEY, "seconds", "optimizer_steps", "gaussians", "train_psnr",
@@ -41,76 +32,16 @@ COLUMNS = (
 Row = dict[str, str]
 
 
-@dataclass(frozen=True)
-class BenchScene:
-    """A dataset at one size."""
-
-    name: str
-    folder: Path
-    size: int
-    llffhold: int = 0
-    splits: tuple[str, ...] = SPLITS
-    short: bool = False
-    """Whether it is trained on without `--whole`."""
-    time_from: str | None = None
-
-
-def read_scenes(data: Path, *, short: bool, names: Sequence[str] = (), file: Path = SCENES) -> list[BenchScene]:
-    """The scenes of the benchmark, or those with the given names, with folders below `data`.
-
-    Raises `InvalidInput` if a name is unknown or a scene has no folder.
-    """
-    tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    unknown = [name for name in names if name not in tables]
-    if unknown:
-        raise InvalidInput("scenes", f"of {', '.join(tables)}", unknown[0])
-    scenes = [BenchScene(name, **{**table, "folder": data / table["folder"]}) for name, table in tables.items()]
-    chosen = [scene for scene in scenes if (scene.name in names if names else scene.short or not short)]
-    missing = sorted({scene.folder.name for scene in chosen if not scene.folder.is_dir()})
-    if missing:
-        raise InvalidInput("data", f"a folder with datasets named {', '.join(missing)}", data)
-    return chosen
-
-
-def make_bench_runs(
-    systems: Mapping[str, TrainConfig], scenes: Sequence[BenchScene], seeds: Sequence[int], out: Path
-) -> list[Run]:
-    """One run per seed, scene and system, in this order: a benchmark that is stopped compares all systems."""
-    require_unique("seed", map(str, seeds))
-    return [
-        Run(name, scene.name, seed, scene.folder.resolve(),
-            out / name / "_".join([scene.name, str(seed), *filter(None, _budget(config)), _digest(config)]),
-            config.updated(seed=seed, size=scene.size, llffhold=scene.llffhold, time_from=scene.time_from))
-        for seed in seeds
-        for scene in scenes
-        for name, config in systems.items()
-    ]  # fmt: skip
-
-
 def key_of(run: Run) -> tuple[str, ...]:
     """The values of `KEY`, which tell the rows of a CSV file apart."""
-    return run.scene, run.system, str(run.seed), *_budget(run.config), _digest(run.config)
-
-
-def _budget(config: TrainConfig) -> tuple[str, str, str]:
-    """Minutes, their kind, and threads."""
-    minutes = "" if config.run.minutes is None else f"{config.run.minutes:g}"
-    return minutes, config.run.time, str(config.run.threads)
+    budget = run.config.run
+    minutes = "" if budget.minutes is None else f"{budget.minutes:g}"
+    return run.scene, run.system, str(run.seed), minutes, budget.time, str(budget.threads), run.settings
 
 
 def key_of_row(row: Row) -> tuple[str, ...]:
     """The same of a row."""
     return tuple(row[name] for name in KEY)
-
-
-def _digest(config: TrainConfig) -> str:
-    """Eight digits that change with any setting besides those of `KEY`, the scene's and the machine's."""
-    same = config.updated(seed=0, size=None, llffhold=0, minutes=None, threads=1, time="wall")
-    groups = same.to_dict()
-    del groups["data"]["time_from"]  # the scene's
-    if config.run.device == "cpu":
-        del groups["run"]["device"]  # only another device changes the digest
-    return hashlib.sha256(json.dumps(groups, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -140,17 +71,16 @@ def append_row(path: Path, row: Row) -> None:
 
 
 def train_and_measure(
-    runs: Sequence[Run], scenes: Sequence[BenchScene], csv_file: Path, jobs: int, on_end: Callable[[Run, RunEnd], None]
+    runs: Sequence[Run], csv_file: Path, pool: AbstractContextManager[Pool], on_end: Callable[[Run, RunEnd], None]
 ) -> bool:
     """Train the runs that have no row in the file, and add their rows; returns False if Ctrl-C has stopped it."""
-    by_name = {scene.name: scene for scene in scenes}
 
     def finish(run: Run, end: RunEnd) -> None:
         on_end(run, end)
         if end.status in ("finished", "was finished"):
-            append_row(csv_file, measure(run, by_name[run.scene]))
+            append_row(csv_file, measure(run))
 
-    return train_all(runs_left(runs, csv_file), processes(jobs), finish)
+    return train_all(runs_left(runs, csv_file), pool, finish)
 
 
 def runs_left(runs: Sequence[Run], csv_file: Path) -> list[Run]:
@@ -165,7 +95,7 @@ def rows_of(runs: Sequence[Run], csv_file: Path) -> list[Row]:
     return [found[key_of(run)] for run in runs if key_of(run) in found]
 
 
-def measure(run: Run, scene: BenchScene) -> Row:
+def measure(run: Run) -> Row:
     """The row of a finished run: metrics of its last model on the images of all splits."""
     metrics = final_metrics(run) or {}
     row = dict(zip(KEY, key_of(run), strict=True)) | {
@@ -177,7 +107,7 @@ def measure(run: Run, scene: BenchScene) -> Row:
         "train_psnr": f"{[line for line in read_metrics(run.folder) if line['kind'] == 'train'][-1]['psnr']:.3f}",
     }
     for split in SPLITS:
-        found = split in scene.splits and split in metrics["splits"]
+        found = split in run.splits and split in metrics["splits"]
         row |= {f"{split}_{name}": value for name, value in (_scores(run, split) if found else {}).items()}
     return {name: row.get(name, "") for name in COLUMNS}
 

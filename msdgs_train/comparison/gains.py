@@ -1,32 +1,19 @@
-"""The table and the figure of the benchmark of many scenes."""
+"""PSNR by scene, and gains over the first system with their intervals, from the rows of runs."""
 
 import statistics
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from msdgs_serve.writing import write_text
-from msdgs_train.comparison.bench import SPLITS, Row
-from msdgs_train.comparison.report import mean_and_deviation, save_figure
+from msdgs_train.comparison.rows import Row
+from msdgs_train.comparison.scenes import SPLITS
 from msdgs_train.evaluation.report import markdown_table
 
-TABLE, PLOT = "bench.md", "bench.png"
 RESAMPLES = 2000
 INTERVAL = (2.5, 97.5)  # percentiles of the bootstrap
 
 
-def write_bench(out: Path, rows: Sequence[Row], systems: Sequence[str]) -> list[Path]:
-    """Write the table and the figure into the folder `out`, each atomically; returns their paths. Gains are over the
-    first of the systems."""
-    out.mkdir(parents=True, exist_ok=True)
-    write_text(out / TABLE, as_markdown(rows, systems))
-    save_figure(draw(rows, systems), out / PLOT)
-    return [out / TABLE, out / PLOT]
-
-
-def as_markdown(rows: Sequence[Row], systems: Sequence[str]) -> str:
+def scenes_as_markdown(rows: Sequence[Row], systems: Sequence[str]) -> str:
     """A line per scene, and the mean over the scenes that all systems have; a column per system and split."""
     scenes = _scenes(rows)
     lines = [[scene, *(_cell(rows, scene, system, s) for s in SPLITS for system in systems)] for scene in scenes]
@@ -41,31 +28,24 @@ def as_markdown(rows: Sequence[Row], systems: Sequence[str]) -> str:
         ]
         shown += ["", f"Gain over {systems[0]} on test images, dB, with the 95 % interval over images:", ""]
         shown.append(markdown_table(["scene", *systems[1:]], gains))
-    first = rows[0]
-    kind = "minutes of CPU time" if first["time"] == "cpu" else "minutes"
-    budget = f"{first['minutes']} {kind} per run on {first['threads']} thread(s) of {machines_of(rows)}"
     days = sorted({row["date"] for row in rows})
-    notes = f"PSNR in dB of the last model, mean ± standard deviation over seeds; {budget}; {days[0]} to {days[-1]}. "
-    notes += "Settings are chosen on val, results reported on test; the mean is over scenes that all systems have, "
+    notes = f"PSNR in dB of the last model, mean ± standard deviation over seeds; {_budget(rows[0])} "
+    notes += f"on {rows[0]['threads']} thread(s) of {machines_of(rows)}; {days[0]} to {days[-1]}. "
+    notes += "The mean is over scenes that all systems have, "
     notes += "that of a gain over scenes that both systems have."
     return "\n".join([*shown, "", notes]) + "\n"
 
 
-def draw(rows: Sequence[Row], systems: Sequence[str]) -> Figure:
-    """A dot per scene, system and seed: PSNR on test images, or on val where there are none."""
-    scenes = _scenes(rows)
-    figure = Figure(figsize=(8, 1.5 + 0.45 * len(scenes)), layout="constrained")
-    axes = figure.subplots()
-    for index, system in enumerate(systems):
-        own = [row for row in rows if row["system"] == system]
-        height = [scenes.index(row["scene"]) + 0.12 * (index - (len(systems) - 1) / 2) for row in own]
-        values = [float(row["test_psnr"] or row["val_psnr"]) for row in own]
-        axes.plot(values, height, "o", ms=5, alpha=0.8, label=system)
-    axes.set(yticks=range(len(scenes)), yticklabels=scenes, xlabel="PSNR on held-out images, dB")
-    axes.invert_yaxis()
-    axes.grid(alpha=0.3)
-    figure.legend(loc="outside lower center", ncols=min(len(systems), 4), fontsize="small")
-    return figure
+def _budget(row: Row) -> str:
+    if not row["minutes"]:
+        return f"{int(row['optimizer_steps']):,} steps per run"
+    return f"{row['minutes']} {'minutes of CPU time' if row['time'] == 'cpu' else 'minutes'} per run"
+
+
+def mean_and_deviation(values: Sequence[float], digits: int) -> str:
+    """Format mean ± sample standard deviation; of a single value only the value."""
+    deviation = f" ± {statistics.stdev(values):,.{digits}f}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):,.{digits}f}{deviation}"
 
 
 def paired_gain(gains: Sequence[np.ndarray]) -> tuple[float, float, float]:
