@@ -69,5 +69,5 @@ def test_the_code_of_python_md_runs(monkeypatch: pytest.MonkeyPatch):
         exec(service.replace("http://localhost:8000", str(running.base_url)), names)
     assert names["frame"].rgb.shape == (400, 400, 3)
     assert names["flow"].motion.shape == (400, 400, 2)
-    assert names["picture"][:4] == b"\x76\x2f\x31\x01", "not an EXR file"
+    assert names["image"][:4] == b"\x76\x2f\x31\x01", "not an EXR file"
     assert names["name"] == "toys"
