@@ -68,7 +68,7 @@ class Sweep:
         self._estimate_all("network", [(BASELINE, level) for level in levels])
         self._estimate_all("other plans", [(text, mildest) for text in self._texts(fitted=False)])
         unvaried = [estimate for estimate in self.estimates if estimate.candidate.pruning_db == mildest]
-        pairs = [pair for level in levels if level != mildest for pair in self._pairs(unvaried, level)]
+        pairs = [pair for level in levels if level != mildest for pair in sorted(self._pairs(unvaried, level))]
         self._estimate_all("plans with pruning", pairs)
         self._estimate_all("SH degree", self._degrees())
         return self._measured()

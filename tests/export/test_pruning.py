@@ -130,11 +130,8 @@ KEPT: dict[str, Callable[[BakedScene], bool]] = {
 def test_a_rule_that_is_switched_off_removes_nothing(tmp_path: Path, rule: str | None):
     off = [rule] if rule else list(RULES)
     others = [name for name in RULES if name not in off]
-    scene = (
-        exported(tmp_path, with_hidden_one(moving_object()), rules=others)
-        .builder.candidate("network", 50.0)
-        .session.scene
-    )
+    builder = exported(tmp_path, with_hidden_one(moving_object()), rules=others).builder
+    scene = builder.candidate("network", 50.0).session.scene
     assert not {entry["rule"] for entry in scene.metadata.left_out} & set(off)
     assert all(KEPT[name](scene) for name in off if name in KEPT)
 
