@@ -58,11 +58,6 @@ class Target:
     packs: bool = True  # whether arrays may be stored in fewer bits
 
     @property
-    def required_psnr(self) -> float | None:
-        """What reports say: `min_psnr`, or None if only bytes are limited."""
-        return None if self.bytes_only else self.min_psnr
-
-    @property
     def plan_part(self) -> float:
         """Of the squared error allowed, the part that plan and pruning may use."""
         return PLAN_PART if self.packs and self.max_bytes is None else 1.0

@@ -47,12 +47,12 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
     _check(options)
     with scratch_folder() as folder, tracked(console) as track:
         images = _held_out_images(model, options.data, track)
-        rules = [rule for rule in RULES if rule not in options.keep]
-        result = contents = None
         checkpoint = Checkpoint.load(model)
         ruler = Ruler(checkpoint, images, track)
         target = _target(options, ruler)
+        rules = [rule for rule in RULES if rule not in options.keep]
         builder = CandidateBuilder.of(checkpoint, ruler, target, folder, rules)
+        result = contents = None
         if options.chosen_plan is None:
             result = Sweep(builder, ruler, target).run()
             chosen = result.points[result.chosen].measured

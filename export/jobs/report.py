@@ -65,7 +65,7 @@ def report(checkpoint: Checkpoint, ruler: Ruler, target: Target, result: SweepRe
         "package_version": __version__,
         "checkpoint_sha256": checkpoint.sha256,
         "machine": {"processor": processor(), "threads": thread_count(), "system": platform.platform()},
-        "min_psnr": target.required_psnr,
+        "min_psnr": None if target.bytes_only else target.min_psnr,
         "max_bytes": target.max_bytes,
         "views": {
             "cameras": len(ruler.cameras),

@@ -46,9 +46,9 @@ class Sweep:
 
     def __init__(self, builder: CandidateBuilder, ruler: Ruler, target: Target) -> None:
         self._builder, self._ruler, self._target = builder, ruler, target
-        self.estimates: list[QuickEstimate] = []
-        self.baseline: QuickEstimate | None = None  # the whole network; None if it can't be run in float32
-        self.refused: list[tuple[str, str]] = []
+        self._estimates: list[QuickEstimate] = []
+        self._baseline: QuickEstimate | None = None  # the whole network; None if it can't be run in float32
+        self._refused: list[tuple[str, str]] = []
         self._measured_errors: dict[Candidate, RenderedError] = {}  # of all frames
         views = ruler.views
         self._timed = [views[len(views) * i // TIMED_VIEWS] for i in range(TIMED_VIEWS)]
@@ -60,14 +60,14 @@ class Sweep:
         file keeps the limits.
         """
         self._estimate_all("the whole network", [(BASELINE, None)])
-        self.baseline = next(iter(self.estimates), None)
-        self._reachable(self.baseline)
+        self._baseline = next(iter(self._estimates), None)
+        self._reachable(self._baseline)
         levels = [level for level in pruning_levels(self._target) if self._builder.pruning.at(level).left_out]
         mildest = next(iter(levels), None)  # plans are then fitted to moving Gaussians only
         self._estimate_all("fitted plans", [(text, mildest) for text in self._texts(fitted=True)])
         self._estimate_all("network", [(BASELINE, level) for level in levels])
         self._estimate_all("other plans", [(text, mildest) for text in self._texts(fitted=False)])
-        unvaried = [estimate for estimate in self.estimates if estimate.candidate.pruning_db == mildest]
+        unvaried = [estimate for estimate in self._estimates if estimate.candidate.pruning_db == mildest]
         pairs = [pair for level in levels if level != mildest for pair in sorted(self._pairs(unvaried, level))]
         self._estimate_all("plans with pruning", pairs)
         self._estimate_all("SH degree", self._degrees())
@@ -82,15 +82,15 @@ class Sweep:
         moving = self._builder.pruning.at(pruning_db).moving
         if plan != BASELINE and not (len(moving.gaussians) and len(moving.deformation)):
             return  # nothing moves: all plans give the same file
-        if self.estimates and (why := self._too_expensive(plan, pruning_db)):
-            self.refused.append((plan, why))
+        if self._estimates and (why := self._too_expensive(plan, pruning_db)):
+            self._refused.append((plan, why))
             return
         try:
             candidate = self._builder.candidate(plan, pruning_db, sh_degree)
-            if not any(estimate.candidate.digest == candidate.digest for estimate in self.estimates):
-                self.estimates.append(self._estimated(candidate))  # else pruning to another PSNR removed the same
+            if not any(estimate.candidate.digest == candidate.digest for estimate in self._estimates):
+                self._estimates.append(self._estimated(candidate))  # else pruning to another PSNR removed the same
         except MsdgsError as error:  # also if its motion overflows in float32
-            self.refused.append((plan, str(error)))
+            self._refused.append((plan, str(error)))
 
     def _estimated(self, candidate: Candidate) -> QuickEstimate:
         view, background, runs = self._timed[0], self._ruler.background, []
@@ -116,16 +116,16 @@ class Sweep:
         """Why a plan that runs layers isn't tried; None if it is."""
         if self._target.max_bytes is not None:
             return None  # its file may be smaller
-        enough = [estimate for estimate in self.estimates if self._target.allows(estimate)]
+        enough = [estimate for estimate in self._estimates if self._target.allows(estimate)]
         fitted = [estimate for estimate in enough if plan_of(estimate.candidate.plan).fitted]
         fastest = min(fitted, key=lambda estimate: estimate.cpu, default=None)
         kind = plan_of(plan)
-        if fastest is None or self.baseline is None or kind.fitted:
+        if fastest is None or self._baseline is None or kind.fitted:
             return None
         model, whole = self._builder.pruning.at(pruning_db).moving, self._builder.model
         layers = parse(plan).count or len(model.deformation)
         work = len(model.gaussians) * layers / max(len(whole.gaussians) * len(whole.deformation), 1)
-        expected = self.baseline.cpu_deformation * work
+        expected = self._baseline.cpu_deformation * work
         if expected < MAX_RELATIVE_COST * fastest.cpu:
             return None
         taken = f"{fastest.candidate.plan} takes {fastest.cpu:.0f} ms for the whole frame"
@@ -151,26 +151,26 @@ class Sweep:
 
     def _degrees(self) -> list[tuple[str, float | None, int]]:
         """Lower SH degrees of the fastest candidates that aren't dominated so far, or of those nearest to the limit."""
-        limit, ahead = self._target.max_bytes, undominated(self.estimates, 1.0, 0.0)
+        limit, ahead = self._target.max_bytes, undominated(self._estimates, 1.0, 0.0)
         ahead.sort(key=lambda e: e.cpu if limit is None else abs(e.size - limit))
         chosen = [estimate.candidate for estimate in ahead[:LOWER_DEGREES]]
         chosen.sort(key=lambda c: c.pruning_db or 0.0)  # so that the trajectories of a pruned model are sampled once
         return [(c.plan, c.pruning_db, degree) for c in chosen for degree in range(c.sh_degree)]
 
     def _measured(self) -> SweepResult:
-        if not self.estimates:
-            raise nothing_left(self.refused)
-        ahead = to_measure(self.estimates, self._target)
-        ahead += [self.baseline] if self.baseline is not None and self.baseline not in ahead else []
+        if not self._estimates:
+            raise nothing_left(self._refused)
+        ahead = to_measure(self._estimates, self._target)
+        ahead += [self._baseline] if self._baseline is not None and self._baseline not in ahead else []
         candidates = [estimate.candidate for estimate in ahead]
         if self._target.max_bytes is None:
             tracked = self._tracked(candidates)
-            measured = list(usable(tracked, lambda each: Measured(each, self._error(each)), self.refused))
+            measured = list(usable(tracked, lambda each: Measured(each, self._error(each)), self._refused))
         else:
-            measured = within_bytes(candidates, self._ruler, self._target, self.refused)
-        points = points_of(measured, self._timed, self._ruler, self.refused)
-        left = [estimate for estimate in self.estimates if estimate not in ahead]
-        return SweepResult(points, left, choose(points, self._target), self.refused, front(points))
+            measured = within_bytes(candidates, self._ruler, self._target, self._refused)
+        points = points_of(measured, self._timed, self._ruler, self._refused)
+        left = [estimate for estimate in self._estimates if estimate not in ahead]
+        return SweepResult(points, left, choose(points, self._target), self._refused, front(points))
 
     def _tracked(self, candidates: list[Candidate]) -> Iterator[Candidate]:
         on_error = self._ruler.track("all frames of the points", len(candidates))
