@@ -90,6 +90,13 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_p
     assert points[finest].error.psnr_worst == max(p.error.psnr_worst for p in points)
 
 
+def test_a_point_that_leaves_something_for_storage_is_preferred_if_it_is_about_as_fast():
+    tight, exact, slow = point(1.0, 50.5), point(1.1, 52.0, 2), point(2.0, 60.0, 3)
+    assert choose([tight, exact, slow], Target(50.0)) == 1
+    assert choose([tight, exact, slow], Target(50.0, packs=False)) == 0
+    assert choose([tight, slow], Target(50.0)) == 0
+
+
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tuple[Parts, SweepResult]:
     parts = new_parts(tmp_path_factory.mktemp("swept"))
