@@ -18,17 +18,19 @@ from rich.progress import track
 
 from benchmarks.export.paper_sized import resized
 from benchmarks.measuring import Times, machine, report_console, table
-from export.jobs.job import Candidate, ExportJob
+from export.jobs.builder import CandidateBuilder
+from export.jobs.candidate import Measured
+from export.jobs.checkpoint import Checkpoint
+from export.jobs.ruler import Ruler
 from export.jobs.store import stored
 from export.jobs.verify import TIMES, verify
 from export.jobs.write import properties
 from export.measure.poses import posed
-from export.measure.rendered_error import RenderedError
 from export.plans.base import BASELINE
 from export.plans.registry import build
-from export.pruning.mask import PruningMask, bake_pruned, full_mask, pruned
+from export.pruning.mask import PruningMask, full_mask, pruned
 from export.storage.choice import GROUPS, packed
-from export.target import MIN_PSNR
+from export.target import Target
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.threads import THREADS_VARIABLE
@@ -112,39 +114,41 @@ def measured(settings: Nodes, width: int, seed: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         checkpoint = Path(folder) / "model.pt"
         save_model(checkpoint, model, replace(SCENE, cameras=[resized(c, settings.size) for c in SCENE.cameras]), 1)
-        job = ExportJob(checkpoint, Path(folder), rules=())
-        candidate = job.candidate(BASELINE, None)
-        error = job.error(candidate)
-        smaller, smaller_error = stored(job, candidate, error, MIN_PSNR)
-        kinds = properties(onnx.load(smaller.path))["left_out"][-1]["stored"]
+        loaded, target = Checkpoint.load(checkpoint), Target()
+        ruler = Ruler(loaded)
+        builder = CandidateBuilder.of(loaded, ruler, target, Path(folder), rules=())
+        whole = ruler.measured(builder.candidate(BASELINE, None))
+        smaller, candidate = stored(whole, ruler, target.min_psnr), whole.candidate
+        kinds = properties(onnx.load(smaller.candidate.path))["left_out"][-1]["stored"]
         return {
             "name": f"{width}, {seed}",
             "errors": verify(candidate.session, candidate.pruned.moving, times=TIMES, tolerance=math.inf),
-            "motion": float(np.abs(np.subtract(*(candidate.session.pose(t)[0] for t in job.info.time_range))).max()),
-            "psnr_worst": error.psnr_worst,
+            "motion": float(np.abs(np.subtract(*(candidate.session.pose(t)[0] for t in loaded.info.time_range))).max()),
+            "psnr_worst": whole.error.psnr_worst,
             "files": {
-                "float32": _file(job, candidate, error, {}),
-                ", ".join(f"{name} {kind}" for name, kind in kinds.items()): _file(job, smaller, smaller_error, kinds),
+                "float32": _file(loaded, whole, {}),
+                ", ".join(f"{name} {kind}" for name, kind in kinds.items()): _file(loaded, smaller, kinds),
             },
-            "times": milliseconds(smaller.path, settings),
+            "times": milliseconds(smaller.candidate.path, settings),
         }
 
 
-def _file(job: ExportJob, candidate: Candidate, error: RenderedError, kinds: Mapping[str, str]) -> dict[str, float]:
-    static, moving = bytes_per_gaussian(job, candidate.size, kinds)
+def _file(checkpoint: Checkpoint, measured: Measured, kinds: Mapping[str, str]) -> dict[str, float]:
+    candidate, error = measured
+    static, moving = bytes_per_gaussian(checkpoint, candidate.size, kinds)
     figures = {"bytes": candidate.size, "static": static, "moving": moving}
     return {**figures, "psnr_worst": error.psnr_worst, "opening": _seconds_to_open(candidate.path)}
 
 
-def bytes_per_gaussian(job: ExportJob, size: int, kinds: Mapping[str, str]) -> tuple[float, float]:
+def bytes_per_gaussian(checkpoint: Checkpoint, size: int, kinds: Mapping[str, str]) -> tuple[float, float]:
     """Bytes of a static Gaussian, and how many more a moving one takes. `size` is that of the file in which all move;
     it is compared with files in which every second Gaussian is static or left out, whose arrays are stored alike."""
-    whole, count = full_mask(job.model), len(job.model.gaussians)
-    canonical, first = posed(job.model, 0.0, deform=False), np.arange(count) % 2 == 0
+    whole, count = full_mask(checkpoint.model), len(checkpoint.model.gaussians)
+    canonical, first = posed(checkpoint.model, 0.0, deform=False), np.arange(count) % 2 == 0
     alike = {**kinds, **{f"static {name}": kind for name, kind in kinds.items() if f"static {name}" in GROUPS}}
 
     def size_of(mask: PruningMask) -> int:
-        baked = bake_pruned(pruned(job.model, mask, canonical, []), job.info, job.sha256)
+        baked = checkpoint.bake(pruned(checkpoint.model, mask, canonical, []))
         return packed(build(BASELINE, baked), alike).ByteSize()
 
     half_static, half = size_of(whole.without(moves=first)), size_of(whole.without(kept=first))
@@ -196,7 +200,7 @@ def self_test() -> int:
     assert abs(exact["static"] - static) < 1
     assert small["static"] < static / 2
     assert 0 < small["moving"] <= 12
-    assert small["psnr_worst"] >= MIN_PSNR
+    assert small["psnr_worst"] >= Target().min_psnr
     return main(Nodes(count=200, layers=1, widths=(16,), nodes=8, seeds=(0,), repeats=2, size=32))
 
 

@@ -13,7 +13,7 @@ from rich.progress import track
 from benchmarks.measuring import Times, machine, report_console, table
 from export.bake import bake
 from export.jobs.frame_memory import frame_memory
-from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES
+from export.jobs.ruler import CAMERAS_PER_TIME, EVALUATION_TIMES
 from export.measure.frames import compare, render
 from export.measure.poses import in_float64
 from export.measure.rendered_error import by_time

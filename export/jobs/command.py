@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,17 +10,21 @@ import onnx
 from rich.console import Console
 from rich.table import Column, Table
 
-from export.jobs.job import Candidate, ExportJob
+from export.jobs.builder import CandidateBuilder
+from export.jobs.candidate import Measured
+from export.jobs.checkpoint import Checkpoint
+from export.jobs.planned import planned
+from export.jobs.points import as_stored
 from export.jobs.report import COLUMNS, gain, report, rows, write_report
-from export.jobs.store import METADATA_BYTES, UNUSABLE, stored, within_bytes
-from export.jobs.sweep import Sweep, as_stored, pruning_levels
+from export.jobs.ruler import Ruler
+from export.jobs.store import stored
+from export.jobs.sweep import Sweep
 from export.jobs.write import Exported, write_scene
-from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
 from export.plans.registry import parse
 from export.progress import Track, tracked
 from export.pruning import RULES
-from export.target import PLAN_PART, TargetNotReached, check_min_psnr, squared
+from export.target import Target, check_min_psnr, default_min_psnr
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.gaussians.model_file import load_model
@@ -41,39 +44,40 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
     _check(options)
     with scratch_folder() as folder, tracked(console) as track:
         images = _held_out_images(model, options.data, track)
+        checkpoint = Checkpoint.load(model)
+        ruler = Ruler(checkpoint, images, track)
+        target = _target(options, ruler)
         rules = [rule for rule in RULES if rule not in options.keep]
-        result = None
-        limits = {"min_psnr": options.min_psnr, "max_bytes": options.max_mb and round(1e6 * options.max_mb)}
-        job = ExportJob(model, folder, **limits, rules=rules, packs=options.packs, images=images, progress=track)
+        builder = CandidateBuilder.of(checkpoint, ruler, target, folder, rules)
+        result = contents = None
         if options.chosen_plan is None:
-            result = Sweep(job).run()
-            chosen, error = result.points[result.chosen].candidate, result.points[result.chosen].error
+            result = Sweep(builder, ruler, target).run()
+            chosen = result.points[result.chosen].measured
         else:
-            planned = _planned if job.max_bytes is None else _planned_within_bytes
-            chosen, error = planned(job, options.chosen_plan)
-        if options.packs and job.max_bytes is None:
-            chosen, error = stored(job, chosen, error, job.min_psnr)
+            chosen = planned(options.chosen_plan, builder, ruler, target)
+        if target.packs and target.max_bytes is None:
+            chosen = stored(chosen, ruler, target.min_psnr)
+        file = chosen.candidate
         exported = write_scene(
             options.scene_file,
-            onnx.load(chosen.float32 or chosen.path),
-            chosen.pruned.moving,
-            packed=onnx.load(chosen.path) if chosen.float32 else None,
-            rendered=error.to_plain(),
+            onnx.load(file.float32 or file.path),
+            file.pruned.moving,
+            packed=onnx.load(file.path) if file.float32 else None,
+            rendered=chosen.error.to_plain(),
             tolerance=options.tolerance,
             times=options.times,
             on_time=track("comparing poses with the model", options.times),
         )
-        contents = None
         if result:
-            result.points[result.chosen] = as_stored(job, result.points[result.chosen], chosen, error)
-            contents = report(job, result)
+            result.points[result.chosen] = as_stored(result.points[result.chosen], chosen, ruler)
+            contents = report(checkpoint, ruler, target, result)
             contents["points"][result.chosen]["bytes"] = exported.size
     if contents:
         _print_table(contents, console)
         console.print(gain(contents), markup=False)
         for path in write_report(contents, options.scene_file):
             console.print(f"wrote {path}", markup=False)
-    _print_chosen(chosen, error, exported, console)
+    _print_chosen(chosen, exported, console)
 
 
 def _check(options: ExportOptions) -> None:
@@ -99,42 +103,12 @@ def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutIma
     return HeldOutImages(data, load_model(model).scene, lambda count: track("images", count))
 
 
-def _planned(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
-    """A candidate of the plan that was asked for, pruned as far as a part of what its own error leaves allows."""
-    whole = job.candidate(plan, None)
-    best = job.error(whole)
-    if best.psnr_worst < job.min_psnr:
-        raise TargetNotReached.psnr(best.psnr_worst, f"the plan {plan} reaches", job.min_psnr)
-    if job.rules:
-        budget = (PLAN_PART if job.packs else 1.0) * (squared(job.min_psnr) - squared(best.psnr_worst))
-        for fraction in (1.0, 0.5, 0.25) if budget > 0 else ():
-            with suppress(*UNUSABLE):  # then less is removed
-                pruned = job.candidate(plan, -10 * math.log10(fraction * budget))
-                error = job.error(pruned)
-                if squared(error.psnr_worst) <= squared(best.psnr_worst) + budget:
-                    return pruned, error
-    return whole, best
-
-
-def _planned_within_bytes(job: ExportJob, plan: str) -> tuple[Candidate, RenderedError]:
-    """Of all levels of pruning that fit: the one with the smallest error, or with the job's `required_psnr` the most
-    pruned that has it."""
-    assert job.max_bytes is not None
-    whole, required = job.candidate(plan, None), job.required_psnr
-    if required is None and whole.size + METADATA_BYTES <= job.max_bytes:
-        return whole, job.error(whole)
-    candidates = [whole]
-    for level in pruning_levels(job) if job.rules else ():
-        with suppress(*UNUSABLE):
-            candidates.append(job.candidate(plan, level))
-    different = {candidate.digest: candidate for candidate in candidates}.values()
-    fitting = within_bytes(job, list(different), [])
-    best, error = max(fitting, key=lambda each: each[1].psnr_worst)
-    if required is None:
-        return best, error
-    if error.psnr_worst < required:
-        raise TargetNotReached.psnr(error.psnr_worst, f"the plan {plan} reaches in so many bytes", required)
-    return [each for each in fitting if each[1].psnr_worst >= required][-1]
+def _target(options: ExportOptions, ruler: Ruler) -> Target:
+    """What was asked for; a PSNR that wasn't is made from the error of the exact frames against held-out images."""
+    min_psnr = default_min_psnr(ruler.exact_images_psnr) if options.min_psnr is None else options.min_psnr
+    max_bytes = None if options.max_mb is None else round(1e6 * options.max_mb)
+    bytes_only = max_bytes is not None and options.min_psnr is None
+    return Target(min_psnr, max_bytes, bytes_only=bytes_only, packs=options.packs)
 
 
 def _print_table(contents: dict, console: Console) -> None:
@@ -146,14 +120,14 @@ def _print_table(contents: dict, console: Console) -> None:
     console.print(table)
 
 
-def _print_chosen(chosen: Candidate, error: RenderedError, exported: Exported, console: Console) -> None:
+def _print_chosen(chosen: Measured, exported: Exported, console: Console) -> None:
     for entry in exported.metadata.left_out:
         saved = f", {entry['bytes_saved'] / 1e3:,.0f} kB saved" if entry.get("bytes_saved") else ""
         frame = f", worst frame then {entry['worst_frame_db']:.1f} dB" if "worst_frame_db" in entry else ""
         console.print(f"left out: {entry['what']}: {entry['count']:,} of {entry['of']:,}{saved}{frame}", markup=False)
     if not exported.metadata.left_out:
         console.print("left out: nothing")
-    measured = exported.measured_error
+    measured, error = exported.measured_error, chosen.error
     console.print(
         f"worst of {error.frames} frames against the exact network in float64: {error.psnr_worst:.1f} dB, "
         f"mean {error.psnr_mean:.1f} dB, worst pixel {error.worst_pixel:.3f}\n"
@@ -166,7 +140,7 @@ def _print_chosen(chosen: Candidate, error: RenderedError, exported: Exported, c
             f"float64, are excluded from these errors. Their largest error is {measured['unstable']['error']:.1e}"
         )
     console.print(
-        f"{exported.path}: plan {chosen.plan}, {exported.size / 1e6:.2f} MB, {exported.moving_count:,} moving and "
-        f"{exported.static_count:,} static Gaussians, {len(exported.metadata.layers)} layers",
+        f"{exported.path}: plan {chosen.candidate.plan}, {exported.size / 1e6:.2f} MB, {exported.moving_count:,} "
+        f"moving and {exported.static_count:,} static Gaussians, {len(exported.metadata.layers)} layers",
         markup=False,
     )

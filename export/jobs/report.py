@@ -7,12 +7,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from export.jobs.checkpoint import Checkpoint
 from export.jobs.figure import draw
-from export.jobs.job import CAMERAS_PER_TIME, EVALUATION_TIMES, ExportJob
+from export.jobs.ruler import CAMERAS_PER_TIME, EVALUATION_TIMES, Ruler
 from export.jobs.sweep import SweepResult
 from export.measure.machine import processor
 from export.plans.base import BASELINE
-from export.target import squared
+from export.target import Target, squared
 from msdgs_serve import __version__
 from msdgs_serve.threads import thread_count
 from msdgs_serve.writing import replacing, write_text
@@ -55,26 +56,26 @@ LEGEND = """\
 """
 
 
-def report(job: ExportJob, result: SweepResult) -> dict[str, Any]:
+def report(checkpoint: Checkpoint, ruler: Ruler, target: Target, result: SweepResult) -> dict[str, Any]:
     """The report as plain values. Errors are reproducible; times are those of this machine."""
     numbered = enumerate(result.points)
     points = [{"front": i in result.front, "chosen": i == result.chosen, **p.to_plain()} for i, p in numbered]
     return {
         "format": FORMAT,
         "package_version": __version__,
-        "checkpoint_sha256": job.sha256,
+        "checkpoint_sha256": checkpoint.sha256,
         "machine": {"processor": processor(), "threads": thread_count(), "system": platform.platform()},
-        "min_psnr": job.required_psnr,
-        "max_bytes": job.max_bytes,
+        "min_psnr": None if target.bytes_only else target.min_psnr,
+        "max_bytes": target.max_bytes,
         "views": {
-            "cameras": len(job.cameras),
-            "evaluation_frames": len(job.exact.views),
+            "cameras": len(ruler.cameras),
+            "evaluation_frames": len(ruler.views),
             "evaluation_times": EVALUATION_TIMES,
             "cameras_per_time": CAMERAS_PER_TIME,
-            "width": job.exact.views[0].camera.width,
-            "height": job.exact.views[0].camera.height,
+            "width": ruler.views[0].camera.width,
+            "height": ruler.views[0].camera.height,
         },
-        "exact_images_psnr": job.exact_images_psnr,
+        "exact_images_psnr": ruler.exact_images_psnr,
         "points": points,
         "dropped": [estimate.to_plain() for estimate in result.estimates],
         "refused": [{"plan": plan, "why": why} for plan, why in result.refused],

@@ -1,42 +1,37 @@
-"""Storage of arrays, of candidates or of a scene file: in as few bytes as an error of frames allows, or as fine as so
-many bytes allow."""
+"""Storage of the arrays of a candidate or of a scene file, in as few bytes as an error of frames allows, or as fine as
+so many bytes allow."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 import onnx
 
-from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob
+from export.jobs.candidate import UNUSABLE, Candidate, Measured
+from export.jobs.ruler import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Ruler
 from export.jobs.write import properties, set_properties
 from export.measure.rendered_error import ExactFrames, RenderedError, within_memory
 from export.measure.views import cameras_of_file, evaluation_views
-from export.storage.choice import COARSEST, Stored, fewest_bytes, packed, smallest_error
-from export.target import TargetNotReached, check_min_psnr, squared
+from export.storage.choice import Stored, fewest_bytes, smallest_error
+from export.target import check_min_psnr, squared
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import as_trained
-from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 
 METADATA_BYTES = 3000
 """Bytes that are kept free for what is measured last and added to the metadata of the written file."""
 
-UNUSABLE = (InvalidInput, SceneFileInvalid)
-"""Errors of a file whose poses can't be drawn: rounded to fewer bits, or overflowing in float32."""
-
-Measured = TypeVar("Measured")
 Measure = Callable[[onnx.ModelProto, int], RenderedError]
 """The error of a scene file's frames: of all, or of every n-th."""
 
 
-def stored(job: ExportJob, chosen: Candidate, error: RenderedError, min_psnr: float) -> tuple[Candidate, RenderedError]:
-    """The candidate with packed arrays and its error, whose worst frame has at least `min_psnr` dB as the given one
-    has; or the given ones if nothing can be packed."""
-    trial = _Trial(job, chosen)
+def stored(chosen: Measured, ruler: Ruler, min_psnr: float) -> Measured:
+    """The candidate with packed arrays, whose worst frame has at least `min_psnr` dB as the given one has; or the given
+    one if nothing can be packed."""
+    trial = _Trial(chosen.candidate, ruler)
     found = _in_fewer_bits(trial.contents, trial.error, min_psnr)
-    return (chosen, error) if found is None else trial.kept(*found)
+    return chosen if found is None else trial.kept(*found)
 
 
 def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelProto, RenderedError] | None:
@@ -65,57 +60,6 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
 
     found = _in_fewer_bits(contents, measured, min_psnr)
     return None if found is None else (_with_entry(contents, *found), found[1])
-
-
-def within_bytes(
-    job: ExportJob, candidates: Sequence[Candidate], refused: list[tuple[str, str]]
-) -> list[tuple[Candidate, RenderedError]]:
-    """Those of the candidates that fit into the job's bytes, with arrays as fine as these allow, and their errors.
-
-    Raises `TargetNotReached` if none fits, and as `usable` does, which also adds to `refused`.
-    """
-    assert job.max_bytes is not None
-    limit, sizes = job.max_bytes, {candidate: min_bytes(job, candidate) for candidate in candidates}
-    if fitting := [candidate for candidate, size in sizes.items() if size <= limit]:
-        return list(usable(fitting, lambda candidate: _finest(job, candidate, limit), refused))
-    by_size = sorted(sizes, key=sizes.__getitem__)
-    candidate, error = next(usable(by_size, lambda candidate: (candidate, _finest(job, candidate, limit)[1]), refused))
-    size, worst = math.ceil(sizes[candidate] / 1e3) / 1e3, error.psnr_worst
-    smallest = f"at least {size:.3f}, the smallest file tried: {worst:.1f} dB on its worst frame"
-    raise TargetNotReached("max_mb", smallest, limit / 1e6)
-
-
-def usable(
-    candidates: Iterable[Candidate],
-    measure: Callable[[Candidate], tuple[Candidate, Measured]],
-    refused: list[tuple[str, str]],
-) -> Iterator[tuple[Candidate, Measured]]:
-    """What `measure` returns for each candidate; those that can't be drawn are added to `refused`, by plan and why.
-
-    Raises `InvalidInput` if no other is left.
-    """
-    none = True
-    for candidate in candidates:
-        try:
-            measured = measure(candidate)
-        except UNUSABLE as error:  # its motion overflows in float32 at a time that no estimate has tried
-            refused.append((candidate.plan, str(error)))
-        else:
-            none = False
-            yield measured
-    if none:
-        raise nothing_left(refused)
-
-
-def nothing_left(refused: Sequence[tuple[str, str]]) -> InvalidInput:
-    """The error of a model of which all plans were refused."""
-    return InvalidInput("model", "one that some plan can hold", "; ".join(why for _, why in refused))
-
-
-def min_bytes(job: ExportJob, candidate: Candidate) -> int:
-    """Size of the smallest file in which a candidate can be written."""
-    size = packed(onnx.load(candidate.path), COARSEST).ByteSize() if job.packs else candidate.size
-    return size + METADATA_BYTES
 
 
 def _in_fewer_bits(
@@ -156,10 +100,11 @@ def _with_entry(contents: onnx.ModelProto, found: Stored, error: RenderedError) 
     return found.contents
 
 
-def _finest(job: ExportJob, candidate: Candidate, max_bytes: int) -> tuple[Candidate, RenderedError]:
-    if not job.packs or candidate.size + METADATA_BYTES <= max_bytes:
-        return candidate, job.error(candidate)
-    trial = _Trial(job, candidate)
+def finest(candidate: Candidate, ruler: Ruler, max_bytes: int) -> Measured:
+    """The candidate with arrays as fine as `max_bytes` allow."""
+    if candidate.size + METADATA_BYTES <= max_bytes:
+        return ruler.measured(candidate)
+    trial = _Trial(candidate, ruler)
     found = smallest_error(trial.contents, _estimate(trial.error), max_bytes - METADATA_BYTES)
     return trial.kept(found, trial.error(found.contents))
 
@@ -167,22 +112,22 @@ def _finest(job: ExportJob, candidate: Candidate, max_bytes: int) -> tuple[Candi
 class _Trial:
     """A candidate whose arrays are packed in several ways."""
 
-    def __init__(self, job: ExportJob, candidate: Candidate) -> None:
+    def __init__(self, candidate: Candidate, ruler: Ruler) -> None:
         self.contents = onnx.load(candidate.path)
-        self._job = job
+        self._ruler = ruler
         self._smaller = replace(candidate, path=candidate.path.with_suffix(".stored.onnx"), float32=candidate.path)
-        self._on_trial = job.progress("storage in fewer bits", 0)
+        self._on_trial = ruler.track("storage in fewer bits", 0)
 
     def error(self, model: onnx.ModelProto, every: int = 1) -> RenderedError:
         """The error of a packed file, of all frames or of every n-th."""
         self._write(model)
         self._on_trial()
-        return self._job.error(self._smaller, every)
+        return self._ruler.error(self._smaller, every)
 
-    def kept(self, found: Stored, error: RenderedError) -> tuple[Candidate, RenderedError]:
+    def kept(self, found: Stored, error: RenderedError) -> Measured:
         """The packed candidate and its error."""
         self._write(_with_entry(self.contents, found, error))
-        return self._smaller, error
+        return Measured(self._smaller, error)
 
     def _write(self, model: onnx.ModelProto) -> None:
         self._smaller.close()

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from export.jobs.job import Candidate
+from export.jobs.candidate import Candidate
 from export.measure.views import View
 from export.progress import Track
 from msdgs_serve.rasterizer import as_trained, rasterize

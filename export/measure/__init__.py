@@ -1,1 +1,1 @@
-"""Errors of exported frames and poses against the model's own, and time and memory of a frame."""
+"""Errors of exported frames and poses against the model's own, and their amplification by layers."""

@@ -9,7 +9,6 @@ import pytest
 import torch
 from onnx import helper
 
-from export.jobs.job import ExportJob
 from export.measure.frames import render
 from export.measure.poses import in_float64, posed
 from export.measure.rendered_error import ExactFrames
@@ -25,6 +24,7 @@ from msdgs_train.evaluation.evaluate import EvaluatedModel
 from msdgs_train.evaluation.layer_strip import camera_of, render_steps
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.viewer.snapshot import Snapshot
+from tests.support.exports import parts_of
 from tests.support.models import CAMERA, SCENE, export_scene, random_model, saved
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import SPLINES, small_config, write_scene
@@ -91,10 +91,10 @@ def test_exact_frames_of_an_export(
     assert exact.measure(exact.pose, rows).psnr_worst == 100.0
     exact.options = GSPLAT
     assert exact.measure(exact.pose, rows).psnr_worst < 40.0
-    job = ExportJob(folder / "model.pt", tmp_path)
-    candidate = job.candidate("network", 50.0)
-    assert job.exact.options == as_trained(candidate.session.scene.metadata) == NARROW
-    assert job.error(candidate).psnr_worst > 50.0
+    parts = parts_of(folder / "model.pt", tmp_path)
+    candidate = parts.builder.candidate("network", 50.0)
+    assert parts.ruler.exact.options == as_trained(candidate.session.scene.metadata) == NARROW
+    assert parts.ruler.error(candidate).psnr_worst > 50.0
     got = candidate.session.gaussians(T)
     drawn = rasterize(got, camera, background=SCENE.background, options=NARROW).rgb.clip(0, 1)
     assert np.square(drawn - expected).mean() < 1e-5

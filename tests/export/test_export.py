@@ -329,7 +329,7 @@ def test_a_folder_is_no_output_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     def work(*_: object, **__: object) -> None:
         raise AssertionError("it is noticed too late")
 
-    for name in ("jobs.command.ExportJob", "importers.command.read_splats", "importers.command.write_model"):
+    for name in ("jobs.command.Checkpoint.load", "importers.command.read_splats", "importers.command.write_model"):
         monkeypatch.setattr(f"export.{name}", work)
     for file_format in ("model", "ply", "deformgs"):
         options = ExportOptions(scene_file.parent / "model.pt", tmp_path, format=file_format)

@@ -11,8 +11,9 @@ import pytest
 import torch
 
 from export.bake import Baked
-from export.jobs import job as jobs
-from export.jobs.job import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Candidate, ExportJob
+from export.jobs import pruned_models, samples
+from export.jobs.candidate import Candidate
+from export.jobs.ruler import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES
 from export.jobs.write import write_scene
 from export.measure.poses import posed
 from export.measure.rendered_error import within_memory
@@ -31,6 +32,7 @@ from msdgs_train.evaluation.metrics import MAX_PSNR
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.layers.mlp import MLPLayer
+from tests.support.exports import Parts, parts_of
 from tests.support.images import psnr
 from tests.support.models import CAMERA, GROUND, MLP, NODES, OBJECT, SCENE, moving_object, random_model, rise, saved
 from tests.support.tolerances import assert_close, tolerance
@@ -40,9 +42,9 @@ pytestmark = pytest.mark.slow
 OBJECT_X = 0.6  # between the ground and the object
 
 
-def job_of(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> ExportJob:
+def exported(folder: Path, model: DynamicGaussians, info: SceneInfo = SCENE, **settings: Any) -> Parts:
     (folder / "candidates").mkdir()
-    return ExportJob(saved(folder, model, info), folder / "candidates", **settings)
+    return parts_of(saved(folder, model, info), folder / "candidates", **settings)
 
 
 def independent_worst_db(candidate: Candidate, model: DynamicGaussians, info: SceneInfo) -> float:
@@ -69,9 +71,9 @@ def test_trajectories_are_those_of_the_pruned_model(
     def overflow(*args: Any) -> None:
         raise SceneFileInvalid("scene", "means", "overflow")
 
-    monkeypatch.setattr(jobs, "ROUND_OFF_DB", MAX_PSNR if float32 == "not exact enough" else 0.0)
+    monkeypatch.setattr(pruned_models, "ROUND_OFF_DB", MAX_PSNR if float32 == "not exact enough" else 0.0)
     if float32 == "overflows":  # at times that stability didn't try
-        monkeypatch.setattr(jobs.SinglePoses, "at", overflow)
+        monkeypatch.setattr(samples.SinglePoses, "at", overflow)
         monkeypatch.setattr(DeformationSession, "gaussians", overflow)
     made = list[tuple[Baked, Trajectories, bool]]()
 
@@ -80,29 +82,29 @@ def test_trajectories_are_those_of_the_pruned_model(
         made.append((baked, Trajectories(baked, *args), not with_sampler))
         return made[-1][1]
 
-    monkeypatch.setattr(jobs, "Trajectories", trajectories)
-    job_of(tmp_path, with_hidden_one(moving_object()), rules=rules).candidate("compact:40", 50.0)
+    monkeypatch.setattr(samples, "Trajectories", trajectories)
+    exported(tmp_path, with_hidden_one(moving_object()), rules=rules).builder.candidate("compact:40", 50.0)
     ((baked, got, in_float64),) = made
     assert in_float64 == (float32 != "exact")
     every = np.arange(len(baked.moving))
-    samples = got.on_grid(COARSE + 1, every)
+    found = got.on_grid(COARSE + 1, every)
     for i in (0, 6, 7, COARSE):
         want = ExactPoses(baked).at(i / COARSE)
-        want[:, QUATS] *= np.sign((want * samples[:, i])[:, QUATS].sum(axis=1, keepdims=True))
-        assert_close(samples[:, i], want.astype(np.float32), "export.relative")
+        want[:, QUATS] *= np.sign((want * found[:, i])[:, QUATS].sum(axis=1, keepdims=True))
+        assert_close(found[:, i], want.astype(np.float32), "export.relative")
 
 
 def test_everything_without_effect_is_pruned_and_listed(tmp_path: Path):
-    job = job_of(tmp_path, with_hidden_one(moving_object()))
-    candidate = job.candidate("network", 50.0)
-    scene, means = candidate.session.scene, job.model.gaussians.means[candidate.pruned.ids]
+    parts = exported(tmp_path, with_hidden_one(moving_object()))
+    candidate = parts.builder.candidate("network", 50.0)
+    scene, means = candidate.session.scene, parts.model.gaussians.means[candidate.pruned.ids]
     left_out = {entry["rule"]: entry for entry in scene.metadata.left_out}
     assert set(left_out) == set(RULES)
     assert means[:, 2].min() > -2  # without the hidden one
     assert (means[: scene.moving_count, 0] > OBJECT_X).all()
     assert (means[scene.moving_count :, 0] < OBJECT_X).all()
     assert 0 < scene.moving_count <= OBJECT
-    assert independent_worst_db(candidate, job.model, SCENE) >= 50
+    assert independent_worst_db(candidate, parts.model, SCENE) >= 50
     assert left_out["static"]["count"] == scene.static_count
     assert (left_out["layers"]["count"], left_out["layers"]["of"]) == (1, 2)
     assert (left_out["heads"]["count"], left_out["heads"]["of"]) == (2, 3)
@@ -128,7 +130,8 @@ KEPT: dict[str, Callable[[BakedScene], bool]] = {
 def test_a_rule_that_is_switched_off_removes_nothing(tmp_path: Path, rule: str | None):
     off = [rule] if rule else list(RULES)
     others = [name for name in RULES if name not in off]
-    scene = job_of(tmp_path, with_hidden_one(moving_object()), rules=others).candidate("network", 50.0).session.scene
+    builder = exported(tmp_path, with_hidden_one(moving_object()), rules=others).builder
+    scene = builder.candidate("network", 50.0).session.scene
     assert not {entry["rule"] for entry in scene.metadata.left_out} & set(off)
     assert all(KEPT[name](scene) for name in off if name in KEPT)
 
@@ -139,23 +142,23 @@ def test_a_prefix_has_the_first_layers_as_trained(tmp_path: Path):
     with torch.no_grad():
         rise(model.deformation.layers[1])
         rise(model.deformation.layers[2])
-    job = job_of(tmp_path, model)
-    assert job.pruned(50.0).network.layers == (1, 2)
-    candidate = job.candidate("prefix:2", 50.0)
+    parts = exported(tmp_path, model)
+    assert parts.builder.pruning.at(50.0).network.layers == (1, 2)
+    candidate = parts.builder.candidate("prefix:2", 50.0)
     scene, ids = candidate.session.scene, candidate.pruned.ids
     assert (len(scene.metadata.layers), scene.metadata.plan) == (2, "prefix:2")
     assert "layers" not in {entry["rule"] for entry in scene.metadata.left_out}
     assert 0 < scene.moving_count <= OBJECT
-    want = job.model.pose(1.0, 2).means.numpy()[ids[: scene.moving_count]]
+    want = parts.model.pose(1.0, 2).means.numpy()[ids[: scene.moving_count]]
     assert_close(candidate.session.pose(1.0)[0], want, "export.relative")
-    job.candidate("prefix:3", 50.0)
+    parts.builder.candidate("prefix:3", 50.0)
     with pytest.raises(InvalidInput, match="prefix:k with k from 1 to 3"):
-        job.candidate("prefix:4", 50.0)
+        parts.builder.candidate("prefix:4", 50.0)
 
 
 def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("export.pruning.rules.MAX_OPERATIONS", 0.0)
-    pruned = job_of(tmp_path, moving_object()).pruned(45.0)
+    pruned = exported(tmp_path, moving_object()).builder.pruning.at(45.0)
     left_out = {entry["rule"] for entry in pruned.left_out}
     assert "layers" not in left_out
     assert "static" in left_out
@@ -165,40 +168,40 @@ def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pyte
 @pytest.mark.parametrize("pruning_db", [30.0, 45.0, 60.0])
 def test_the_error_bound_holds_in_other_frames(tmp_path: Path, pruning_db: float):
     model = random_model(400, sh_degree=1, noise=0.02)
-    job = job_of(tmp_path, model)
-    candidate = job.candidate("network", pruning_db)
-    assert job.error(candidate).psnr_worst >= pruning_db
+    parts = exported(tmp_path, model)
+    candidate = parts.builder.candidate("network", pruning_db)
+    assert parts.ruler.error(candidate).psnr_worst >= pruning_db
     # at other times a frame may be slightly worse
     assert independent_worst_db(candidate, model, SCENE) >= pruning_db - tolerance("pruning.other_times_db")
 
 
 def test_a_higher_psnr_prunes_less(tmp_path: Path):
-    job = job_of(tmp_path, random_model(400, sh_degree=1, noise=0.02))
-    sizes = [job.candidate("network", pruning_db).size for pruning_db in (30.0, 55.0, None)]
+    parts = exported(tmp_path, random_model(400, sh_degree=1, noise=0.02))
+    sizes = [parts.builder.candidate("network", pruning_db).size for pruning_db in (30.0, 55.0, None)]
     assert sizes == sorted(sizes)
     assert sizes[0] < sizes[-1]
 
 
 def test_an_error_of_zero_is_found_for_the_whole_network(tmp_path: Path):
-    job = job_of(tmp_path, moving_object())
-    error = job.error(job.candidate("network", None))
+    parts = exported(tmp_path, moving_object())
+    error = parts.ruler.error(parts.builder.candidate("network", None))
     assert error.psnr_worst >= tolerance("export.float32_db")
     assert error.position <= tolerance("export.relative")
 
 
 def test_a_change_of_one_gaussian_is_measured(tmp_path: Path):
     model = moving_object()
-    job = job_of(tmp_path, model)
+    parts = exported(tmp_path, model)
     ids = np.arange(GROUND + OBJECT)
     moved = 0.125
 
     def pose(t: float) -> Gaussians:
-        g = job.exact.pose(t)
+        g = parts.ruler.exact.pose(t)
         means = g.means.copy()
         means[-1] += [0, moved, 0]
         return Gaussians(means, g.quats, g.scales, g.opacities, g.sh)
 
-    error = job.exact.measure(pose, ids)
+    error = parts.ruler.exact.measure(pose, ids)
     np.testing.assert_allclose(error.position, moved, rtol=tolerance("float32.relative"))
     assert error.worst_pixel > 0
     assert error.psnr_worst <= error.psnr_mean
@@ -274,14 +277,14 @@ def test_cameras_are_added_where_too_few_are_stored(count: int):
     ],
 )
 def test_unusual_scenes_are_pruned_and_written(tmp_path: Path, count: int, changes: dict[str, Any], info: SceneInfo):
-    job = job_of(tmp_path, random_model(count, **changes), info)
-    candidate = job.candidate("network", 50.0)
-    error = job.error(candidate)
+    parts = exported(tmp_path, random_model(count, **changes), info)
+    candidate = parts.builder.candidate("network", 50.0)
+    error = parts.ruler.error(candidate)
     assert error.psnr_worst >= 50
     contents = onnx.load(candidate.path)
-    exported = write_scene(tmp_path / "s.onnx", contents, candidate.pruned.moving, rendered=error.to_plain(), times=4)
-    assert exported.measured_error["rendered"]["psnr_worst"] == error.psnr_worst
-    assert exported.moving_count + exported.static_count == len(candidate.pruned.ids)
+    written = write_scene(tmp_path / "s.onnx", contents, candidate.pruned.moving, rendered=error.to_plain(), times=4)
+    assert written.measured_error["rendered"]["psnr_worst"] == error.psnr_worst
+    assert written.moving_count + written.static_count == len(candidate.pruned.ids)
 
 
 def test_gaussians_that_appear_later_are_kept_and_those_that_never_change_are_static(tmp_path: Path):
@@ -293,25 +296,25 @@ def test_gaussians_that_appear_later_are_kept_and_those_that_never_change_are_st
         layer.heads.weight[layer.outputs.columns["opacities"], :2] = torch.tensor([4.0, -4.0])  # 8 t, times 1 / 2
         model.gaussians.raw_opacities[GROUND:] = -6.0
         model.gaussians.sh_dc[:GROUND] *= 0.5
-    job = job_of(tmp_path, model)
-    candidate = job.candidate("network", 50.0)
-    scene, means = candidate.session.scene, job.model.gaussians.means[candidate.pruned.ids]
+    parts = exported(tmp_path, model)
+    candidate = parts.builder.candidate("network", 50.0)
+    scene, means = candidate.session.scene, parts.model.gaussians.means[candidate.pruned.ids]
     assert (scene.changing, scene.metadata.sh_degree) == (("opacities", "sh"), 0)
     assert (means[: scene.moving_count, 0] > OBJECT_X).all()
     assert 0.5 * OBJECT < scene.moving_count <= OBJECT
-    assert job.error(candidate).psnr_worst >= 50
-    assert independent_worst_db(candidate, job.model, SCENE) >= 50
-    exported = write_scene(tmp_path / "s.onnx", onnx.load(candidate.path), candidate.pruned.moving, times=4)
-    assert exported.measured_error["opacities"] <= tolerance("export.relative")
+    assert parts.ruler.error(candidate).psnr_worst >= 50
+    assert independent_worst_db(candidate, parts.model, SCENE) >= 50
+    written = write_scene(tmp_path / "s.onnx", onnx.load(candidate.path), candidate.pruned.moving, times=4)
+    assert written.measured_error["opacities"] <= tolerance("export.relative")
 
 
 @pytest.mark.parametrize("kind", ["spline", "mlp", "plane"])
 def test_layers_on_nodes_keep_all_heads(tmp_path: Path, kind: str):
     """The file moves Gaussians as the model does, whose order alone is changed."""
     model = random_model(40, noise=0.2, support=NODES, layers=(kind,))
-    job = job_of(tmp_path, model)
-    assert "heads" not in {entry["rule"] for entry in job.candidate("network", 50.0).pruned.left_out}
-    candidate = job.candidate("network", None)
+    parts = exported(tmp_path, model)
+    assert "heads" not in {entry["rule"] for entry in parts.builder.candidate("network", 50.0).pruned.left_out}
+    candidate = parts.builder.candidate("network", None)
     order = morton_order(model.gaussians.means.detach().numpy())
     start, end = (posed(model, t) for t in SCENE.time_range)
     assert np.abs(end.means - start.means).max() > 0.01

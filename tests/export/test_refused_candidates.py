@@ -3,22 +3,24 @@
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
-from export.jobs.job import ESTIMATE_STRIDE, Candidate, ExportJob
-from export.jobs.store import within_bytes
-from export.jobs.sweep import Sweep
+from export.jobs.builder import CandidateBuilder
+from export.jobs.candidate import Candidate
+from export.jobs.fit_bytes import within_bytes
+from export.jobs.ruler import ESTIMATE_STRIDE, Ruler
 from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions
 from export.plans.registry import PLANS
-from export.target import TargetNotReached
+from export.target import Target, TargetNotReached
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
+from tests.support.exports import parts_of
 from tests.support.models import moving_object, saved
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_candidates")]
@@ -28,9 +30,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("few_candidates")]
 def test_plans_whose_motion_overflows_in_float32_are_refused_and_fitted_ones_are_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str
 ):
-    job = ExportJob(saved(tmp_path, moving_object()), tmp_path, min_psnr=45.0)
+    parts = parts_of(saved(tmp_path, moving_object()), tmp_path, Target(45.0))
     whole = DeformationSession.pose
-    views = job.exact.views
+    views = parts.ruler.views
     one = ({view.t for view in views} - {view.t for view in views[::ESTIMATE_STRIDE]}).pop()
 
     def pose(session: DeformationSession, t: float, *args: Any, **kwargs: Any) -> Any:
@@ -40,32 +42,32 @@ def test_plans_whose_motion_overflows_in_float32_are_refused_and_fitted_ones_are
 
     monkeypatch.setattr(DeformationSession, "pose", pose)
     monkeypatch.setitem(PLANS, "compact", replace(PLANS["compact"], candidates=lambda layers: ["compact:70"]))
-    result = Sweep(job).run()
+    result = parts.sweep()
     assert {plan for plan, why in result.refused if "overflow" in why} == {"network", "prefix:1"}
     assert {point.candidate.plan for point in result.points} == {"compact:70"}
 
 
 def test_a_file_of_few_bytes_that_overflows_is_refused_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    measure, overflowing, refused = ExportJob.error, set[float | None](), list[tuple[str, str]]()
+    measure, overflowing, refused = Ruler.error, set[float | None](), list[tuple[str, str]]()
 
-    def error(job: ExportJob, candidate: Candidate, every: int = 1) -> RenderedError:
+    def error(ruler: Ruler, candidate: Candidate, every: int = 1) -> RenderedError:
         if every == 1 and candidate.pruning_db in overflowing:
             raise SceneFileInvalid("scene", "means", "overflow")
-        return measure(job, candidate, every)
+        return measure(ruler, candidate, every)
 
-    job = ExportJob(saved(tmp_path, moving_object()), tmp_path, max_bytes=10**6)
-    candidates = [job.candidate("network", level) for level in (None, 50.0)]
-    monkeypatch.setattr(ExportJob, "error", error)
+    few, many = (Target(max_bytes=size, bytes_only=True) for size in (1000, 10**6))
+    _, builder, ruler, _ = parts_of(saved(tmp_path, moving_object()), tmp_path, many)
+    candidates = [builder.candidate("network", level) for level in (None, 50.0)]
+    monkeypatch.setattr(Ruler, "error", error)
     overflowing.add(50.0)
-    assert [kept.pruning_db for kept, _ in within_bytes(job, candidates, refused)] == [None]
-    job.max_bytes = 1000
+    assert [kept.pruning_db for kept, _ in within_bytes(candidates, ruler, many, refused)] == [None]
     with pytest.raises(TargetNotReached, match="the smallest file tried"):
-        within_bytes(job, candidates, refused)
+        within_bytes(candidates, ruler, few, refused)
     assert refused == [("network", "scene: `means` overflow")] * 2
     overflowing.add(None)
-    for job.max_bytes in (1000, 10**6):
+    for target in (few, many):
         with pytest.raises(InvalidInput, match=r"one that some plan can hold, got .*overflow"):
-            within_bytes(job, candidates, refused)
+            within_bytes(candidates, ruler, target, refused)
 
 
 def test_a_candidate_that_overflows_at_the_time_of_a_held_out_image_is_refused_alone(
@@ -82,10 +84,10 @@ def test_a_candidate_that_overflows_at_the_time_of_a_held_out_image_is_refused_a
             raise SceneFileInvalid("scene", "means", "overflow")
         return whole(session, t, *args, **kwargs)
 
-    job = ExportJob(saved(tmp_path, moving_object()), tmp_path, min_psnr=45.0)
-    job.images = cast(Any, SimpleNamespace(training=(), psnr=psnr))
+    images = SimpleNamespace(training=(), psnr=psnr)
+    parts = parts_of(saved(tmp_path, moving_object()), tmp_path, Target(45.0), images=images)
     monkeypatch.setattr(DeformationSession, "pose", overflowing)
-    result = Sweep(job).run()
+    result = parts.sweep()
     assert ("network", "scene: `means` overflow") in result.refused
     assert ("network", None) not in {(point.candidate.plan, point.candidate.pruning_db) for point in result.points}
 
@@ -95,16 +97,18 @@ def test_a_candidate_that_overflows_at_the_time_of_a_held_out_image_is_refused_a
 def test_a_plan_is_written_less_pruned_if_a_pruned_one_cannot_be_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, max_mb: float | None, without: int
 ):
-    made, levels = ExportJob.candidate, list[float]()
+    made, levels = CandidateBuilder.candidate, list[float]()
 
-    def candidate(job: ExportJob, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> Candidate:
+    def candidate(
+        builder: CandidateBuilder, plan: str, pruning_db: float | None, sh_degree: int | None = None
+    ) -> Candidate:
         if pruning_db is not None:
             levels.append(pruning_db)
             if len(levels) <= without:
                 raise InvalidInput("plan", "possible", plan)
-        return made(job, plan, pruning_db, sh_degree)
+        return made(builder, plan, pruning_db, sh_degree)
 
-    monkeypatch.setattr(ExportJob, "candidate", candidate)
+    monkeypatch.setattr(CandidateBuilder, "candidate", candidate)
     options = ExportOptions(saved(tmp_path, moving_object()), plan="network", min_psnr=45.0, max_mb=max_mb, times=4)
     assert main(options) == 0
     assert len(levels) > 1

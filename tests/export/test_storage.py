@@ -16,7 +16,8 @@ from export.bake import bake
 from export.convert import main as convert_main
 from export.exporters.round_trip import RoundTrip
 from export.importers.sequence import Frames, sequence_scene
-from export.jobs.job import ExportJob
+from export.jobs.checkpoint import Checkpoint
+from export.jobs.ruler import Ruler
 from export.jobs.write import properties, set_properties
 from export.layers.graph import GraphBuilder
 from export.measure.poses import posed
@@ -158,7 +159,7 @@ def test_a_written_file_is_smaller_and_its_frames_have_the_error_that_it_says(tm
     assert again == pytest.approx(rendered["psnr_worst"], abs=tolerance("redrawn"))
     assert sizes[0] < sizes[1]
     session, any_ids = DeformationSession(output), np.zeros(len(scene), int)  # which only distances depend on
-    drawn = ExportJob(checkpoint, tmp_path).exact.measure(session.gaussians, any_ids)
+    drawn = Ruler(Checkpoint.load(checkpoint)).exact.measure(session.gaussians, any_ids)
     assert drawn.psnr_worst == rendered["psnr_worst"]
 
 

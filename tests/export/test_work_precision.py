@@ -13,18 +13,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from export.jobs.job import ExportJob
+from export.jobs.checkpoint import Checkpoint
+from export.jobs.estimates import QuickEstimate, to_measure
+from export.jobs.points import TIME_MARGIN, Point, choose, front
 from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.jobs.sweep import TIME_MARGIN, Point, QuickEstimate, Sweep, SweepResult, choose, front
+from export.jobs.ruler import Ruler
+from export.jobs.sweep import SweepResult
 from export.jobs.timing import FrameTime, Milliseconds
 from export.measure.poses import Pose
 from export.measure.rendered_error import RenderedError
 from export.options import ExportOptions, Kept
 from export.pruning import RULES
+from export.target import Target, TargetNotReached, default_min_psnr
 from export.to_onnx import main
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
+from tests.support.exports import Parts, parts_of
 from tests.support.models import GROUND, OBJECT, moving_object, random_model, saved
 from tests.support.tolerances import tolerance
 
@@ -71,32 +76,47 @@ def test_no_dominated_point_is_on_the_front_or_chosen(points: list[Point], min_p
         beaten = any(b.costs != a.costs and all(x <= y for x, y in zip(b.costs, a.costs, strict=True)) for b in points)
         first_of_equals = [p.costs for p in points].index(a.costs) == i
         assert (i in ahead) == (first_of_equals and not beaten)
-    best = choose(points, min_psnr)
     within = [p for p in points if p.error.psnr_worst >= min_psnr]
-    assert (best is None) == (not within)
-    if best is not None:
+    target = Target(min_psnr, packs=False)
+    if within:
+        best = choose(points, target)
         assert best in ahead
         longest = TIME_MARGIN * min(p.milliseconds for p in within)
         assert points[best].milliseconds <= longest
         assert points[best].candidate.size == min(p.candidate.size for p in within if p.milliseconds <= longest)
-    finest = choose(points, None)
+    else:
+        with pytest.raises(TargetNotReached, match="which a file reaches"):
+            choose(points, target)
+    finest = choose(points, Target(max_bytes=10, bytes_only=True))
     assert finest in ahead
     assert points[finest].error.psnr_worst == max(p.error.psnr_worst for p in points)
 
 
+def test_a_point_that_leaves_something_for_storage_is_preferred_if_it_is_about_as_fast():
+    tight, exact, slow = point(1.0, 50.5), point(1.1, 52.0, 2), point(2.0, 60.0, 3)
+    assert choose([tight, exact, slow], Target(50.0)) == 1
+    assert choose([tight, exact, slow], Target(50.0, packs=False)) == 0
+    assert choose([tight, slow], Target(50.0)) == 0
+
+
 @pytest.fixture(scope="module")
-def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tuple[ExportJob, SweepResult]:
-    job = new_job(tmp_path_factory.mktemp("swept"))
-    return job, Sweep(job).run()
+def swept(tmp_path_factory: pytest.TempPathFactory, few_candidates: None) -> tuple[Parts, SweepResult]:
+    parts = new_parts(tmp_path_factory.mktemp("swept"))
+    return parts, parts.sweep()
 
 
-def new_job(folder: Path) -> ExportJob:
+def new_parts(folder: Path) -> Parts:
     (folder / "candidates").mkdir()
-    return ExportJob(saved(folder, moving_object()), folder / "candidates", min_psnr=45.0)
+    return parts_of(saved(folder, moving_object()), folder / "candidates", Target(45.0))
+
+
+def report_of(swept: tuple[Parts, SweepResult]) -> dict[str, Any]:
+    (checkpoint, _, ruler, target), result = swept
+    return report(checkpoint, ruler, target, result)
 
 
 def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_the_error(
-    swept: tuple[ExportJob, SweepResult],
+    swept: tuple[Parts, SweepResult],
 ):
     _, result = swept
     whole = [p for p in result.points if p.candidate.plan == "network" and p.candidate.pruning_db is None]
@@ -109,21 +129,20 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
 
 def test_what_cannot_be_chosen_is_measured_last(monkeypatch: pytest.MonkeyPatch):
     """Of too many candidates, however fast it is."""
-    monkeypatch.setattr("export.jobs.sweep.MAX_POINTS", 3)
-    exact = SimpleNamespace(views=[None])
-    kept = []
-    for min_psnr in (50.0, None):
-        sweep = Sweep(cast(Any, SimpleNamespace(required_psnr=min_psnr, max_bytes=None, exact=exact)))
-        measured = ((1.0, 40.0), (2.0, 45.0), (3.0, 51.0), (4.0, 60.0), (5.0, 65.0), (6.0, 70.0))
-        sweep.estimates = [QuickEstimate(cast(Any, None), cpu, 0.0, db, 1) for cpu, db in measured]
-        kept.append([estimate.cpu for estimate in sweep.ahead()])
-        sweep.estimates = sweep.estimates[:3]
-        kept.append([estimate.cpu for estimate in sweep.ahead()])
+    monkeypatch.setattr("export.jobs.estimates.MAX_POINTS", 3)
+    measured = ((1.0, 40.0), (2.0, 45.0), (3.0, 51.0), (4.0, 60.0), (5.0, 65.0), (6.0, 70.0))
+    estimates = [QuickEstimate(cast(Any, None), cpu, 0.0, db, 1) for cpu, db in measured]
+    targets = Target(50.0), Target(max_bytes=10, bytes_only=True)
+    kept = [
+        [estimate.cpu for estimate in to_measure(some, target)]
+        for target in targets
+        for some in (estimates, estimates[:3])
+    ]
     assert kept == [[3, 4, 5], [3, 1, 2], [6, 5, 4], [3, 2, 1]]
 
 
-def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
-    contents = report(*swept)
+def test_the_report_says_what_was_gained(swept: tuple[Parts, SweepResult]):
+    contents = report_of(swept)
     whole = next(p for p in contents["points"] if p["plan"] == "network" and p["pruning_db"] is None)
     chosen = next(p for p in contents["points"] if p["chosen"])
     whole["milliseconds"]["deformation"]["min"], chosen["milliseconds"]["deformation"]["min"] = 1480.0, 3.7
@@ -131,13 +150,13 @@ def test_the_report_says_what_was_gained(swept: tuple[ExportJob, SweepResult]):
     assert "all layers for all Gaussians take 1,480.0 ms, 400.0 times as long." in gain(contents)
 
 
-def test_the_same_model_has_the_same_errors(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
+def test_the_same_model_has_the_same_errors(swept: tuple[Parts, SweepResult], tmp_path: Path):
     """Up to rounding: libraries may add in another order."""
-    again, result = new_job(tmp_path), swept[1]
+    again, result = new_parts(tmp_path), swept[1]
     for p in (result.points[result.chosen], result.points[front(result.points)[-1]]):
         c = p.candidate
-        lower = c.sh_degree if c.sh_degree < again.pruned(c.pruning_db).moving.config.sh_degree else None
-        error = again.error(again.candidate(c.plan, c.pruning_db, lower))
+        lower = c.sh_degree if c.sh_degree < again.builder.pruning.at(c.pruning_db).moving.config.sh_degree else None
+        error = again.ruler.error(again.builder.candidate(c.plan, c.pruning_db, lower))
         assert (error.worst_frame, error.frames) == (p.error.worst_frame, p.error.frames)
         found, wanted = (
             (e.psnr_mean, e.psnr_worst, e.worst_pixel, e.position, e.position_pixels) for e in (error, p.error)
@@ -145,8 +164,8 @@ def test_the_same_model_has_the_same_errors(swept: tuple[ExportJob, SweepResult]
         assert found == pytest.approx(wanted, rel=tolerance("float32.relative"))
 
 
-def test_the_report_has_its_fields(swept: tuple[ExportJob, SweepResult], tmp_path: Path):
-    contents = report(*swept)
+def test_the_report_has_its_fields(swept: tuple[Parts, SweepResult], tmp_path: Path):
+    contents = report_of(swept)
     paths = write_report(contents, tmp_path / "ball.onnx")
     assert [path.name for path in paths] == ["ball.report.json", "ball.report.md", "ball.report.png"]
     read = json.loads(paths[0].read_text())
@@ -236,7 +255,7 @@ def test_a_limit_of_bytes_is_kept_with_the_error_that_the_file_says(
     refused = exported(0.001)
     assert "`max_mb` must be at least" in refused
     smallest = float(refused.split("at least ")[1].split(",")[0])
-    reached, exact = [], ExportJob(checkpoint, tmp_path).exact
+    reached, exact = [], Ruler(Checkpoint.load(checkpoint)).exact
     for max_mb in (smallest, 10.0):
         assert not exported(max_mb)
         assert output.stat().st_size <= 1e6 * max_mb
@@ -258,14 +277,12 @@ def test_a_limit_of_bytes_is_kept_with_the_error_that_the_file_says(
     assert "must be at" in exported(smallest, min_psnr=99.5)
 
 
-def test_the_default_error_adds_a_twentieth_of_a_decibel_to_that_of_held_out_images(tmp_path: Path):
-    checkpoint = saved(tmp_path, random_model(60))
+def test_the_default_error_adds_a_twentieth_of_a_decibel_to_that_of_held_out_images():
     for model_db in (18.0, 25.6, 37.3):
-        images = cast(Any, SimpleNamespace(training=(), psnr=lambda pose, options, db=model_db: db))
-        allowed = ExportJob(checkpoint, tmp_path, images=images).min_psnr
+        allowed = default_min_psnr(model_db)
         added = [10 * np.log10(1 + 10 ** ((model_db - db) / 10)) for db in (allowed, allowed - 0.1)]
         assert added[0] <= 0.05 < added[1]
-    assert ExportJob(checkpoint, tmp_path).min_psnr == 50
+    assert default_min_psnr(None) == 50
 
 
 def test_each_rule_of_pruning_has_a_switch():
@@ -309,7 +326,7 @@ def test_the_chosen_point_of_a_report_is_the_file_that_was_written(tmp_path: Pat
 
     images = SimpleNamespace(training=(), psnr=psnr)
     monkeypatch.setattr("export.jobs.command._held_out_images", lambda *_: images)
-    monkeypatch.setattr("export.jobs.sweep.frame_memory", lambda paths, *_: [path.stat().st_size for path in paths])
+    monkeypatch.setattr("export.jobs.points.frame_memory", lambda paths, *_: [path.stat().st_size for path in paths])
     assert main(ExportOptions(saved(tmp_path, moving_object()), min_psnr=45.0)) == 0
     (chosen,) = (p for p in json.loads((tmp_path / "model.report.json").read_text())["points"] if p["chosen"])
     assert chosen["packed"]
