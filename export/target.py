@@ -87,9 +87,9 @@ class Target:
 
         Raises `TargetNotReached` if there is none; `where` says what reaches the highest PSNR.
         """
-        most_exact = max(files, key=lambda file: file.error.psnr_worst)
-        self.require(most_exact.error, where)
-        return most_exact if self.bytes_only else preferred([file for file in files if self.allows(file.error)])
+        finest = max(files, key=lambda file: file.error.psnr_worst)
+        self.require(finest.error, where)
+        return finest if self.bytes_only else preferred([file for file in files if self.allows(file.error)])
 
 
 def default_min_psnr(exact_images_psnr: float | None) -> float:
