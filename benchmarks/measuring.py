@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from export.measure.machine import processor
+from msdgs_export.measure.machine import processor
 from msdgs_serve.threads import thread_count
 
 REPORT_WIDTH = 170

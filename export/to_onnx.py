@@ -1,40 +1,11 @@
-"""`python export/to_onnx.py model.pt`: one ONNX scene file from a trained model, as fast as its error may be."""
+"""`python export/to_onnx.py model.pt`: `msdgs-export` of this checkout, from any folder."""
 
 import sys
-from os.path import dirname, realpath
-
-if __name__ == "__main__":  # as a file, from any folder: the checkout's packages, not this folder's modules
-    folder = dirname(realpath(__file__))
-    sys.path[:] = [dirname(folder), *(path for path in sys.path if realpath(path or ".") != folder)]
-
-    from msdgs_serve.process import begin
-
-    begin()
-
-from export.command_line import Console, run, tyro
-from export.options import ExportOptions, with_values_of_up
-from msdgs_serve.scene.errors import InvalidInput
-from msdgs_serve.scene.metadata import MAX_NUMBER
-
-
-def main(options: ExportOptions) -> int:
-    """Export, and print progress and errors. Returns the exit status."""
-
-    def exported(console: Console) -> None:
-        with console.status("loading torch and onnxruntime"):
-            from export.importers.command import model_or_import  # slow to import: not before --help
-            from export.importers.scene import changed_metadata
-            from export.jobs.command import export
-        if options.duration is not None and not 0 < options.duration <= MAX_NUMBER:
-            raise InvalidInput("duration", "seconds above 0", options.duration)
-        with model_or_import(options, console) as model:
-            if model is not None:
-                export(model, options, console)
-        if options.duration is not None:
-            changed_metadata(options.scene_file, duration=options.duration)
-
-    return run(exported, "stopped; existing files are complete")
-
+from pathlib import Path
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(ExportOptions, args=with_values_of_up(sys.argv[1:]))))
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+    from msdgs_export.commands import to_onnx
+
+    sys.exit(to_onnx())

@@ -14,11 +14,11 @@ import tyro
 from benchmarks.measuring import machine
 from benchmarks.rasterizer.scenes import object_scene
 from benchmarks.service.process import Running, service
-from export.exporters.ply import write_ply
-from export.importers.detect import detect_format
-from export.importers.errors import ImportFailed
-from export.options import ExportOptions
-from export.to_onnx import main as to_onnx
+from msdgs_export.cli.to_onnx import main as to_onnx
+from msdgs_export.exporters.ply import write_ply
+from msdgs_export.importers.detect import detect_format
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.options import ExportOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_train.evaluation.sheets import Panel, draw_sheet
 from tests.support.splat_files import splat_bytes

@@ -18,19 +18,19 @@ from rich.progress import track
 
 from benchmarks.export.paper_sized import resized
 from benchmarks.measuring import Times, machine, report_console, table
-from export.jobs.builder import CandidateBuilder
-from export.jobs.candidate import Measured
-from export.jobs.checkpoint import Checkpoint
-from export.jobs.ruler import Ruler
-from export.jobs.store import stored
-from export.jobs.verify import TIMES, verify
-from export.jobs.write import properties
-from export.measure.poses import posed
-from export.plans.base import BASELINE
-from export.plans.registry import build
-from export.pruning.mask import PruningMask, full_mask, pruned
-from export.storage.choice import GROUPS, packed
-from export.target import Target
+from msdgs_export.jobs.builder import CandidateBuilder
+from msdgs_export.jobs.candidate import Measured
+from msdgs_export.jobs.checkpoint import Checkpoint
+from msdgs_export.jobs.ruler import Ruler
+from msdgs_export.jobs.store import stored
+from msdgs_export.jobs.verify import TIMES, verify
+from msdgs_export.jobs.write import properties
+from msdgs_export.measure.poses import posed
+from msdgs_export.plans.base import BASELINE
+from msdgs_export.plans.registry import build
+from msdgs_export.pruning.mask import PruningMask, full_mask, pruned
+from msdgs_export.storage.choice import GROUPS, packed
+from msdgs_export.target import Target
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.threads import THREADS_VARIABLE
@@ -44,7 +44,7 @@ OPENINGS = 3
 
 @dataclass(frozen=True)
 class Nodes:
-    """Export random models on control nodes as `export/to_onnx.py --plan network` does, unpruned, in float32 and in
+    """Export random models on control nodes as `msdgs-export --plan network` does, unpruned, in float32 and in
     fewer bits, and print errors, sizes and times.
 
     python -m benchmarks.export.nodes --widths 96 128 --seeds 0 1

@@ -22,11 +22,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from benchmarks.measuring import machine
-from export.measure.frames import compare, render
-from export.measure.poses import posed
-from export.measure.views import cameras_of, selection_views
-from export.trajectories.sampling import give_one_sign
-from export.trajectories.splines import along_time, fitting
+from msdgs_export.measure.frames import compare, render
+from msdgs_export.measure.poses import posed
+from msdgs_export.measure.views import cameras_of, selection_views
+from msdgs_export.trajectories.sampling import give_one_sign
+from msdgs_export.trajectories.splines import along_time, fitting
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_train.evaluation.layer_strip import camera_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
@@ -153,7 +153,7 @@ def main(
 
     python -m benchmarks.export.paper_sized runs/toybench/model.pt runs/paper_sized/model.pt
 
-    python export/to_onnx.py runs/paper_sized/model.pt
+    msdgs-export runs/paper_sized/model.pt
 
     Args:
         model: A trained `model.pt` of MLP layers.

@@ -11,16 +11,16 @@ from rich.console import Console
 from rich.progress import track
 
 from benchmarks.measuring import Times, machine, report_console, table
-from export.bake import bake
-from export.jobs.frame_memory import frame_memory
-from export.jobs.ruler import CAMERAS_PER_TIME, EVALUATION_TIMES
-from export.measure.frames import compare, render
-from export.measure.poses import in_float64
-from export.measure.rendered_error import by_time
-from export.measure.views import View, evaluation_views
-from export.plans.base import BASELINE
-from export.plans.registry import build
-from export.progress import no_progress
+from msdgs_export.bake import bake
+from msdgs_export.jobs.frame_memory import frame_memory
+from msdgs_export.jobs.ruler import CAMERAS_PER_TIME, EVALUATION_TIMES
+from msdgs_export.measure.frames import compare, render
+from msdgs_export.measure.poses import in_float64
+from msdgs_export.measure.rendered_error import by_time
+from msdgs_export.measure.views import View, evaluation_views
+from msdgs_export.plans.base import BASELINE
+from msdgs_export.plans.registry import build
+from msdgs_export.progress import no_progress
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.scene.metadata import SceneCamera
@@ -48,7 +48,7 @@ def main(
     Memory is the peak of loading the file and drawing a frame, above that of the idle process.
 
     Args:
-        scene: A file that `export/to_onnx.py` made of the model.
+        scene: A file that `msdgs-export` made of the model.
         model: The `model.pt`.
         data: The folder of the dataset.
         split: Its split whose cameras are taken: val or test.

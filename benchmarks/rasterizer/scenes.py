@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from export.importers.splats.formats import read_splats
+from msdgs_export.importers.splats.formats import read_splats
 from msdgs_serve.scene import Camera, Gaussians
 
 MEDIAN_SCALES = {10_000: 0.010, 100_000: 0.007, 300_000: 0.005, 1_000_000: 0.0035}

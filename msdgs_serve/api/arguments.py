@@ -34,7 +34,7 @@ Serve scenes over HTTP: POST /render returns a frame for any camera and any time
   msdgs-serve --compile                   compile the kernels for later starts, and exit
   MSDGS_SCENES=scenes/ msdgs-serve        every option is also an environment variable with the prefix MSDGS_
 
-`python export/to_onnx.py model.pt` writes a scene file. The running service documents its API at /docs.
+`msdgs-export model.pt` writes a scene file. The running service documents its API at /docs.
 """
 
 

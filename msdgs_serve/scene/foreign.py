@@ -36,4 +36,4 @@ def foreign_name(name: str) -> str | None:
 
 
 def _to_import(what: str, name: str) -> str:
-    return f"is {what}, not a scene file: `python export/to_onnx.py {name}` turns it into one"
+    return f"is {what}, not a scene file: `msdgs-export {name}` turns it into one"

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from export.plans.registry import PLANS
+from msdgs_export.plans.registry import PLANS
 
 
 @pytest.fixture(scope="module")
@@ -23,5 +23,5 @@ def few_candidates() -> Iterator[None]:
             ("store.EVALUATION_TIMES", 6),
             ("timing.REPEATS", 3),
         ):
-            patch.setattr(f"export.jobs.{name}", value)
+            patch.setattr(f"msdgs_export.jobs.{name}", value)
         yield

@@ -14,9 +14,9 @@ import numpy as np
 import onnx
 import torch
 
-from export.bake import bake
-from export.measure.poses import half_diagonal, in_float64, largest_error, pose_errors, posed
-from export.plans.registry import build
+from msdgs_export.bake import bake
+from msdgs_export.measure.poses import half_diagonal, in_float64, largest_error, pose_errors, posed
+from msdgs_export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
@@ -46,7 +46,7 @@ def exported(model: DynamicGaussians, scene: SceneInfo = SCENE) -> DeformationSe
 
 def file_error(model: DynamicGaussians, scene: SceneInfo = SCENE, session: DeformationSession | None = None) -> float:
     """Return the largest error of the file's poses against the model in float64, at both ends and between, as
-    `export.jobs.verify` measures it."""
+    `msdgs_export.jobs.verify` measures it."""
     session = session or exported(model, scene)
     exact, worst = in_float64(model), 0.0
     for t in (scene.time_range[0], sum(scene.time_range) / 2, scene.time_range[1]):

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from export.measure.frames import PoseRenderer, compare, in_frame, project
-from export.measure.poses import in_float64
+from msdgs_export.measure.frames import PoseRenderer, compare, in_frame, project
+from msdgs_export.measure.poses import in_float64
 from msdgs_serve.scene import Gaussians
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_train.gaussians.model import DynamicGaussians

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from export.measure.amplification import through_layers
-from export.measure.poses import posed
-from export.precision.assess import assess
-from export.precision.report import StabilityReport
+from msdgs_export.measure.amplification import through_layers
+from msdgs_export.measure.poses import posed
+from msdgs_export.precision.assess import assess
+from msdgs_export.precision.report import StabilityReport
 from msdgs_train.gaussians.model import DynamicGaussians
 from tests.export.stability_rows import Change, Row, changed, measured, refused, worst_frame
 from tests.support.models import MLP, NODES, PLANE, SCENE, SMALL_LAYERS

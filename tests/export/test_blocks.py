@@ -7,11 +7,11 @@ import pytest
 import torch
 from onnx import numpy_helper
 
-from export.bake import bake
-from export.importers.sequence import Frames, sequence_scene
-from export.plans.registry import build
-from export.spatial_order import morton_order
-from export.supports.blocks import block_layout
+from msdgs_export.bake import bake
+from msdgs_export.importers.sequence import Frames, sequence_scene
+from msdgs_export.plans.registry import build
+from msdgs_export.spatial_order import morton_order
+from msdgs_export.supports.blocks import block_layout
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_train.gaussians.model import DynamicGaussians

@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.bake import bake
-from export.measure.poses import posed
-from export.measure.views import cameras_of
-from export.plans import compact
-from export.plans.compact import chosen
-from export.plans.registry import build
-from export.pruning.mask import bake_pruned, full_mask, pruned
-from export.trajectories import sensitivity
-from export.trajectories.levels import OWN, PEAKS, RANKS, Levels, sizes
-from export.trajectories.sampling import Trajectories
-from export.trajectories.sensitivity import sensitivities
-from export.trajectories.splines import design
-from export.trajectories.stored import StoredPoses
+from msdgs_export.bake import bake
+from msdgs_export.measure.poses import posed
+from msdgs_export.measure.views import cameras_of
+from msdgs_export.plans import compact
+from msdgs_export.plans.compact import chosen
+from msdgs_export.plans.registry import build
+from msdgs_export.pruning.mask import bake_pruned, full_mask, pruned
+from msdgs_export.trajectories import sensitivity
+from msdgs_export.trajectories.levels import OWN, PEAKS, RANKS, Levels, sizes
+from msdgs_export.trajectories.sampling import Trajectories
+from msdgs_export.trajectories.sensitivity import sensitivities
+from msdgs_export.trajectories.splines import design
+from msdgs_export.trajectories.stored import StoredPoses
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.gaussians import Gaussians

@@ -9,10 +9,10 @@ import pytest
 import torch
 from onnx import helper
 
-from export.measure.frames import render
-from export.measure.poses import in_float64, posed
-from export.measure.rendered_error import ExactFrames
-from export.measure.views import View
+from msdgs_export.measure.frames import render
+from msdgs_export.measure.poses import in_float64, posed
+from msdgs_export.measure.rendered_error import ExactFrames
+from msdgs_export.measure.views import View
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT, as_trained, rasterize
 from msdgs_serve.renderer import Renderer

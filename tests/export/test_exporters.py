@@ -16,18 +16,18 @@ from onnx import TensorProto, numpy_helper
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from export.bake import bake
-from export.exporters import gltf
-from export.exporters.command import LOSSLESS, LOSSY, convert
-from export.exporters.gltf import EXTENSION, read_gltf, write_gltf
-from export.exporters.ply import write_ply
-from export.exporters.round_trip import ConversionFailed, visionary_of
-from export.exporters.usd import read_usd
-from export.exporters.visionary import visionary_model
-from export.importers.sequence import Frames, read_sequence, sequence_scene
-from export.importers.splats.formats import read_splats
-from export.options import ConvertOptions
-from export.plans.registry import build
+from msdgs_export.bake import bake
+from msdgs_export.exporters import gltf
+from msdgs_export.exporters.command import LOSSLESS, LOSSY, convert
+from msdgs_export.exporters.gltf import EXTENSION, read_gltf, write_gltf
+from msdgs_export.exporters.ply import write_ply
+from msdgs_export.exporters.round_trip import ConversionFailed, visionary_of
+from msdgs_export.exporters.usd import read_usd
+from msdgs_export.exporters.visionary import visionary_model
+from msdgs_export.importers.sequence import Frames, read_sequence, sequence_scene
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.options import ConvertOptions
+from msdgs_export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging.image import srgb_to_linear
@@ -101,7 +101,7 @@ def test_an_interrupted_sequence_leaves_no_file(tmp_path: Path, monkeypatch: pyt
         written.append(file)
 
     with monkeypatch.context() as patch:
-        patch.setattr("export.exporters.command.write_ply", write_two)
+        patch.setattr("msdgs_export.exporters.command.write_ply", write_two)
         with pytest.raises(KeyboardInterrupt):
             run(scene, tmp_path / "frames", frames=4)
     assert len(written) == 2

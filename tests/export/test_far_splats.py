@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export.options import ExportOptions
-from export.to_onnx import main as to_onnx
+from msdgs_export.cli.to_onnx import main as to_onnx
+from msdgs_export.options import ExportOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.renderer import Renderer

@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from export.exporters.spz import write_spz
-from export.importers import command
-from export.importers.command import model_or_import
-from export.importers.detect import detect_format, frame_files
-from export.importers.errors import ImportFailed
-from export.importers.sequence import read_sequence
-from export.importers.splats.formats import read_splats
-from export.options import ExportOptions
+from msdgs_export.exporters.spz import write_spz
+from msdgs_export.importers import command
+from msdgs_export.importers.command import model_or_import
+from msdgs_export.importers.detect import detect_format, frame_files
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.sequence import read_sequence
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.options import ExportOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.renderer import Renderer

@@ -13,12 +13,12 @@ import pytest
 import torch
 from rich.console import Console
 
-from export.importers.command import model_or_import
-from export.importers.errors import ImportFailed
-from export.importers.runs.model import RUNS, write_model
-from export.importers.splats.formats import read_splats
-from export.measure.poses import posed as posed_model
-from export.options import ExportOptions
+from msdgs_export.importers.command import model_or_import
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.runs.model import RUNS, write_model
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.measure.poses import posed as posed_model
+from msdgs_export.options import ExportOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from export.importers import guard
-from export.importers.errors import ImportFailed
-from export.importers.guard import read_guarded
-from export.importers.runs.state import State
-from export.importers.splats.formats import READERS, UNPACKED, read_splats
+from msdgs_export.importers import guard
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.guard import read_guarded
+from msdgs_export.importers.runs.state import State
+from msdgs_export.importers.splats.formats import READERS, UNPACKED, read_splats
 from tests.support.splat_files import some_gaussians, write_splats
 
 
@@ -96,7 +96,7 @@ def test_no_splat_file_is_unpacked_in_this_process(tmp_path: Path, monkeypatch: 
 def test_no_torch_file_of_others_is_unpacked_in_this_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     values = {"a.weight": torch.rand(3, 2, dtype=torch.float64), "b": torch.tensor([True])}
     torch.save(values, tmp_path / "deform.pth")
-    monkeypatch.setattr("export.importers.runs.state.load", lambda _: pytest.fail("in this process"))
+    monkeypatch.setattr("msdgs_export.importers.runs.state.load", lambda _: pytest.fail("in this process"))
     state = State(tmp_path / "deform.pth")
     assert torch.equal(state.read("a.weight", None, 2), values["a.weight"].float())
     assert state.read("b", 1).item() == 1

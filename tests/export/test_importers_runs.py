@@ -13,17 +13,17 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from export.bake import bake
-from export.importers.command import model_or_import
-from export.importers.detect import detect_format
-from export.importers.errors import ImportFailed
-from export.importers.runs import base
-from export.importers.runs.fidelity import as_trained
-from export.importers.runs.model import write_model
-from export.measure.poses import posed
-from export.options import ExportOptions
-from export.plans.registry import build
-from export.to_onnx import main as to_onnx
+from msdgs_export.bake import bake
+from msdgs_export.cli.to_onnx import main as to_onnx
+from msdgs_export.importers.command import model_or_import
+from msdgs_export.importers.detect import detect_format
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.runs import base
+from msdgs_export.importers.runs.fidelity import as_trained
+from msdgs_export.importers.runs.model import write_model
+from msdgs_export.measure.poses import posed
+from msdgs_export.options import ExportOptions
+from msdgs_export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.scene.errors import InvalidInput
@@ -42,7 +42,7 @@ QUIET = Console(quiet=True)
 @pytest.fixture(autouse=True)
 def _networks_are_read_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Not in processes of their own, which first load torch: test_importers_guarded.py is about those."""
-    monkeypatch.setattr("export.importers.runs.state.read_guarded", lambda read, file: read(file))
+    monkeypatch.setattr("msdgs_export.importers.runs.state.read_guarded", lambda read, file: read(file))
 
 
 def imported(run: Path, kind: str) -> tuple[DynamicGaussians, list[dict[str, Any]]]:

@@ -15,14 +15,14 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.special import expit
 
-from export.exporters.gltf import EXTENSION, read_gltf, write_gltf
-from export.exporters.ply import write_ply
-from export.exporters.spz import write_spz
-from export.exporters.usd import write_usd
-from export.importers.splats.base import as_float32
-from export.importers.splats.ksplat import read_ksplat
-from export.importers.splats.ply import read_ply
-from export.importers.splats.spz import COORDINATE_SYSTEM, read_spz
+from msdgs_export.exporters.gltf import EXTENSION, read_gltf, write_gltf
+from msdgs_export.exporters.ply import write_ply
+from msdgs_export.exporters.spz import write_spz
+from msdgs_export.exporters.usd import write_usd
+from msdgs_export.importers.splats.base import as_float32
+from msdgs_export.importers.splats.ksplat import read_ksplat
+from msdgs_export.importers.splats.ply import read_ply
+from msdgs_export.importers.splats.spz import COORDINATE_SYSTEM, read_spz
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from tests.support.splat_files import angles, assert_same, some_gaussians, spz3_bytes, spz4_bytes

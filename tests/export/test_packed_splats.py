@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export.importers.detect import detect_format, frame_files
-from export.importers.errors import ImportFailed
-from export.importers.splats import formats
-from export.importers.splats.formats import read_splats
-from export.importers.splats.unpack import MIN_LIMIT
+from msdgs_export.importers.detect import detect_format, frame_files
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.splats import formats
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.importers.splats.unpack import MIN_LIMIT
 from tests.support.splat_files import FORMATS, inria_columns, ply_bytes, some_gaussians, write_splats
 
 G = some_gaussians(20)

@@ -11,12 +11,12 @@ import pytest
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from export.bake import bake
-from export.exporters.command import convert
-from export.exporters.gltf import read_gltf
-from export.importers.splats.formats import read_splats
-from export.options import ConvertOptions
-from export.plans.registry import build
+from msdgs_export.bake import bake
+from msdgs_export.exporters.command import convert
+from msdgs_export.exporters.gltf import read_gltf
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.options import ConvertOptions
+from msdgs_export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.scene.similarity import Similarity

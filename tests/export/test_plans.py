@@ -12,20 +12,20 @@ import onnx
 import pytest
 import torch
 
-from export.bake import Baked, bake
-from export.jobs.verify import verify
-from export.layers import HEAD_COLUMNS, LAYERS, ModelNotExportable
-from export.layers.chain import summed_deltas
-from export.layers.graph import GraphBuilder
-from export.measure.poses import in_float64
-from export.measure.rendered_error import ExactFrames
-from export.measure.times import times_to_verify
-from export.measure.views import cameras_of, evaluation_views
-from export.plans.base import Plan
-from export.plans.network import network
-from export.plans.registry import PLANS, build, parse
-from export.supports import SUPPORTS, SupportExport, SupportInputs
-from export.trajectories.sampling import Trajectories
+from msdgs_export.bake import Baked, bake
+from msdgs_export.jobs.verify import verify
+from msdgs_export.layers import HEAD_COLUMNS, LAYERS, ModelNotExportable
+from msdgs_export.layers.chain import summed_deltas
+from msdgs_export.layers.graph import GraphBuilder
+from msdgs_export.measure.poses import in_float64
+from msdgs_export.measure.rendered_error import ExactFrames
+from msdgs_export.measure.times import times_to_verify
+from msdgs_export.measure.views import cameras_of, evaluation_views
+from msdgs_export.plans.base import Plan
+from msdgs_export.plans.network import network
+from msdgs_export.plans.registry import PLANS, build, parse
+from msdgs_export.supports import SUPPORTS, SupportExport, SupportInputs
+from msdgs_export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import BSpline
 
-from export.bake import Baked, bake
-from export.plans.registry import build
-from export.trajectories import sampling as module
-from export.trajectories.poses import ExactPoses
-from export.trajectories.sampling import Trajectories
-from export.trajectories.splines import design, fitting, samples_for
+from msdgs_export.bake import Baked, bake
+from msdgs_export.plans.registry import build
+from msdgs_export.trajectories import sampling as module
+from msdgs_export.trajectories.poses import ExactPoses
+from msdgs_export.trajectories.sampling import Trajectories
+from msdgs_export.trajectories.splines import design, fitting, samples_for
 from msdgs_serve.deformation import DeformationSession
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance

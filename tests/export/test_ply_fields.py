@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export.importers.errors import ImportFailed
-from export.importers.splats.base import LOG_SCALE_LIMIT, Splats
-from export.importers.splats.formats import read_splats
-from export.importers.splats.ply_fields import PLY
-from export.importers.splats.spacetime import Spacetime
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.splats.base import LOG_SCALE_LIMIT, Splats
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.importers.splats.ply_fields import PLY
+from msdgs_export.importers.splats.spacetime import Spacetime
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from tests.support.splat_files import compressed_ply_bytes, inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance

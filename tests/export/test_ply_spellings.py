@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from export.importers.detect import detect_format
-from export.importers.errors import ImportFailed
-from export.importers.splats.base import LOG_SCALE_LIMIT
-from export.importers.splats.formats import read_splats
-from export.importers.splats.ply import read_ply
+from msdgs_export.importers.detect import detect_format
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.splats.base import LOG_SCALE_LIMIT
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.importers.splats.ply import read_ply
 from tests.support.splat_files import (
     FORMATS,
     compressed_ply_bytes,

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from export.exporters.command import convert
-from export.importers.command import model_or_import
-from export.importers.errors import ImportFailed
-from export.importers.polynomial import polynomial_scene
-from export.importers.sequence import read_sequence
-from export.importers.splats.ply import read_ply
-from export.options import ConvertOptions, ExportOptions
+from msdgs_export.exporters.command import convert
+from msdgs_export.importers.command import model_or_import
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.polynomial import polynomial_scene
+from msdgs_export.importers.sequence import read_sequence
+from msdgs_export.importers.splats.ply import read_ply
+from msdgs_export.options import ConvertOptions, ExportOptions
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.quaternion import to_matrix
 from tests.support.splat_files import drawn, inria_columns, ply_bytes, some_gaussians

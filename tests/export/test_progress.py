@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from export.measure import poses
-from export.progress import tracked
+from msdgs_export.measure import poses
+from msdgs_export.progress import tracked
 from tests.support.models import NODES, random_model
 from tests.support.tolerances import assert_close
 

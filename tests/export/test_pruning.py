@@ -10,18 +10,18 @@ import onnx
 import pytest
 import torch
 
-from export.bake import Baked
-from export.jobs import pruned_models, samples
-from export.jobs.candidate import Candidate
-from export.jobs.ruler import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES
-from export.jobs.write import write_scene
-from export.measure.poses import posed
-from export.measure.rendered_error import within_memory
-from export.measure.views import cameras_of, evaluation_views, selection_views
-from export.pruning import RULES
-from export.spatial_order import morton_order
-from export.trajectories.poses import QUATS, ExactPoses
-from export.trajectories.sampling import COARSE, Trajectories
+from msdgs_export.bake import Baked
+from msdgs_export.jobs import pruned_models, samples
+from msdgs_export.jobs.candidate import Candidate
+from msdgs_export.jobs.ruler import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES
+from msdgs_export.jobs.write import write_scene
+from msdgs_export.measure.poses import posed
+from msdgs_export.measure.rendered_error import within_memory
+from msdgs_export.measure.views import cameras_of, evaluation_views, selection_views
+from msdgs_export.pruning import RULES
+from msdgs_export.spatial_order import morton_order
+from msdgs_export.trajectories.poses import QUATS, ExactPoses
+from msdgs_export.trajectories.sampling import COARSE, Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import Gaussians
@@ -157,7 +157,7 @@ def test_a_prefix_has_the_first_layers_as_trained(tmp_path: Path):
 
 
 def test_layers_too_expensive_to_test_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("export.pruning.rules.MAX_OPERATIONS", 0.0)
+    monkeypatch.setattr("msdgs_export.pruning.rules.MAX_OPERATIONS", 0.0)
     pruned = exported(tmp_path, moving_object()).builder.pruning.at(45.0)
     left_out = {entry["rule"] for entry in pruned.left_out}
     assert "layers" not in left_out
@@ -221,7 +221,7 @@ def test_with_less_memory_for_frames_pruning_is_still_decided_all_over_time(monk
     views = selection_views(cameras_of(SCENE), (0.0, 1.0), 33, 3)
     frame = 12 * views[0].camera.width * views[0].camera.height
     for count in (50, 25, 11):
-        monkeypatch.setattr("export.measure.rendered_error.MEMORY", count * frame)
+        monkeypatch.setattr("msdgs_export.measure.rendered_error.MEMORY", count * frame)
         times = [view.t for view in within_memory(views, 0)]
         assert len(set(times)) == min(count, 33)
         assert (min(times), max(times)) == (0.0, 1.0)

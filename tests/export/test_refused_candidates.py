@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from export.jobs.builder import CandidateBuilder
-from export.jobs.candidate import Candidate
-from export.jobs.fit_bytes import within_bytes
-from export.jobs.ruler import ESTIMATE_STRIDE, Ruler
-from export.measure.poses import Pose
-from export.measure.rendered_error import RenderedError
-from export.options import ExportOptions
-from export.plans.registry import PLANS
-from export.target import Target, TargetNotReached
-from export.to_onnx import main
+from msdgs_export.cli.to_onnx import main
+from msdgs_export.jobs.builder import CandidateBuilder
+from msdgs_export.jobs.candidate import Candidate
+from msdgs_export.jobs.fit_bytes import within_bytes
+from msdgs_export.jobs.ruler import ESTIMATE_STRIDE, Ruler
+from msdgs_export.measure.poses import Pose
+from msdgs_export.measure.rendered_error import RenderedError
+from msdgs_export.options import ExportOptions
+from msdgs_export.plans.registry import PLANS
+from msdgs_export.target import Target, TargetNotReached
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid

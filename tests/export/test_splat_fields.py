@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from export.importers.detect import detect_format
-from export.importers.errors import ImportFailed
-from export.importers.splats import ksplat, sog, splat, spz_container
-from export.importers.splats.base import Splats, as_float32
-from export.importers.splats.ksplat import read_ksplat
-from export.importers.splats.sog import read_sog
-from export.importers.splats.splat import read_splat
-from export.importers.splats.spz import read_spz
+from msdgs_export.importers.detect import detect_format
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.splats import ksplat, sog, splat, spz_container
+from msdgs_export.importers.splats.base import Splats, as_float32
+from msdgs_export.importers.splats.ksplat import read_ksplat
+from msdgs_export.importers.splats.sog import read_sog
+from msdgs_export.importers.splats.splat import read_splat
+from msdgs_export.importers.splats.spz import read_spz
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from tests.support.splat_files import (
     assert_same,

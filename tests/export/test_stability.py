@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from export.measure.frames import PoseRenderer, compare
-from export.measure.poses import in_float64
-from export.precision.assess import assess
-from export.precision.report import PlanUnsafe
-from export.stability import UNSTABLE, main
+from msdgs_export.cli.stability import UNSTABLE, main
+from msdgs_export.measure.frames import PoseRenderer, compare
+from msdgs_export.measure.poses import in_float64
+from msdgs_export.precision.assess import assess
+from msdgs_export.precision.report import PlanUnsafe
 from msdgs_serve.process import EXIT_INVALID
 from tests.export import stability_extreme, stability_rows, stability_stiff
 from tests.export.stability_rows import FAILS, Row

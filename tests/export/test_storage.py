@@ -12,22 +12,22 @@ import pytest
 import torch
 from onnx import TensorProto
 
-from export.bake import bake
-from export.convert import main as convert_main
-from export.exporters.round_trip import RoundTrip
-from export.importers.sequence import Frames, sequence_scene
-from export.jobs.checkpoint import Checkpoint
-from export.jobs.ruler import Ruler
-from export.jobs.write import properties, set_properties
-from export.layers.graph import GraphBuilder
-from export.measure.poses import posed
-from export.measure.views import cameras_of
-from export.options import ConvertOptions, ExportOptions, Kept
-from export.plans.registry import build
-from export.storage.choice import COARSEST, GROUPS, fewest_bytes, packed, smallest_error
-from export.storage.kinds import Pack, directions, fractions, in_range, logarithms, low_rank
-from export.to_onnx import main
-from export.trajectories.sampling import Trajectories
+from msdgs_export.bake import bake
+from msdgs_export.cli.convert import main as convert_main
+from msdgs_export.cli.to_onnx import main
+from msdgs_export.exporters.round_trip import RoundTrip
+from msdgs_export.importers.sequence import Frames, sequence_scene
+from msdgs_export.jobs.checkpoint import Checkpoint
+from msdgs_export.jobs.ruler import Ruler
+from msdgs_export.jobs.write import properties, set_properties
+from msdgs_export.layers.graph import GraphBuilder
+from msdgs_export.measure.poses import posed
+from msdgs_export.measure.views import cameras_of
+from msdgs_export.options import ConvertOptions, ExportOptions, Kept
+from msdgs_export.plans.registry import build
+from msdgs_export.storage.choice import COARSEST, GROUPS, fewest_bytes, packed, smallest_error
+from msdgs_export.storage.kinds import Pack, directions, fractions, in_range, logarithms, low_rank
+from msdgs_export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.scene import Gaussians

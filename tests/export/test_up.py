@@ -8,16 +8,16 @@ import pytest
 import tyro
 from rich.console import Console
 
-from export.exporters.gltf import write_gltf
-from export.importers.command import model_or_import
-from export.importers.errors import ImportFailed
-from export.importers.scene import static_scene
-from export.importers.sequence import read_sequence, sequence_scene
-from export.importers.splats.axes import up_direction, upright
-from export.importers.splats.base import Splats
-from export.importers.splats.formats import read_splats
-from export.importers.splats.ply import read_ply
-from export.options import ExportOptions, with_values_of_up
+from msdgs_export.exporters.gltf import write_gltf
+from msdgs_export.importers.command import model_or_import
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.scene import static_scene
+from msdgs_export.importers.sequence import read_sequence, sequence_scene
+from msdgs_export.importers.splats.axes import up_direction, upright
+from msdgs_export.importers.splats.base import Splats
+from msdgs_export.importers.splats.formats import read_splats
+from msdgs_export.importers.splats.ply import read_ply
+from msdgs_export.options import ExportOptions, with_values_of_up
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput

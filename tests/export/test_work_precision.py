@@ -13,19 +13,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from export.jobs.checkpoint import Checkpoint
-from export.jobs.estimates import QuickEstimate, to_measure
-from export.jobs.points import TIME_MARGIN, Point, choose, front
-from export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
-from export.jobs.ruler import Ruler
-from export.jobs.sweep import SweepResult
-from export.jobs.timing import FrameTime, Milliseconds
-from export.measure.poses import Pose
-from export.measure.rendered_error import RenderedError
-from export.options import ExportOptions, Kept
-from export.pruning import RULES
-from export.target import Target, TargetNotReached, default_min_psnr
-from export.to_onnx import main
+from msdgs_export.cli.to_onnx import main
+from msdgs_export.jobs.checkpoint import Checkpoint
+from msdgs_export.jobs.estimates import QuickEstimate, to_measure
+from msdgs_export.jobs.points import TIME_MARGIN, Point, choose, front
+from msdgs_export.jobs.report import COLUMNS, FORMAT, gain, report, rows, write_report
+from msdgs_export.jobs.ruler import Ruler
+from msdgs_export.jobs.sweep import SweepResult
+from msdgs_export.jobs.timing import FrameTime, Milliseconds
+from msdgs_export.measure.poses import Pose
+from msdgs_export.measure.rendered_error import RenderedError
+from msdgs_export.options import ExportOptions, Kept
+from msdgs_export.pruning import RULES
+from msdgs_export.target import Target, TargetNotReached, default_min_psnr
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
@@ -129,7 +129,7 @@ def test_the_sweep_keeps_the_whole_network_to_compare_with_and_chooses_within_th
 
 def test_what_cannot_be_chosen_is_measured_last(monkeypatch: pytest.MonkeyPatch):
     """Of too many candidates, however fast it is."""
-    monkeypatch.setattr("export.jobs.estimates.MAX_POINTS", 3)
+    monkeypatch.setattr("msdgs_export.jobs.estimates.MAX_POINTS", 3)
     measured = ((1.0, 40.0), (2.0, 45.0), (3.0, 51.0), (4.0, 60.0), (5.0, 65.0), (6.0, 70.0))
     estimates = [QuickEstimate(cast(Any, None), cpu, 0.0, db, 1) for cpu, db in measured]
     targets = Target(50.0), Target(max_bytes=10, bytes_only=True)
@@ -325,8 +325,10 @@ def test_the_chosen_point_of_a_report_is_the_file_that_was_written(tmp_path: Pat
         return 20 + float(pose(0.5).scales.mean(dtype=np.float64))
 
     images = SimpleNamespace(training=(), psnr=psnr)
-    monkeypatch.setattr("export.jobs.command._held_out_images", lambda *_: images)
-    monkeypatch.setattr("export.jobs.points.frame_memory", lambda paths, *_: [path.stat().st_size for path in paths])
+    monkeypatch.setattr("msdgs_export.jobs.command._held_out_images", lambda *_: images)
+    monkeypatch.setattr(
+        "msdgs_export.jobs.points.frame_memory", lambda paths, *_: [path.stat().st_size for path in paths]
+    )
     assert main(ExportOptions(saved(tmp_path, moving_object()), min_psnr=45.0)) == 0
     (chosen,) = (p for p in json.loads((tmp_path / "model.report.json").read_text())["points"] if p["chosen"])
     assert chosen["packed"]
@@ -341,7 +343,7 @@ def test_a_plan_of_all_layers_is_written_although_one_has_no_effect(tmp_path: Pa
     assert 0 < scene.moving_count <= OBJECT
 
 
-@pytest.mark.parametrize("place", ["export.jobs.command.Sweep.run", "export.jobs.command.write_scene"])
+@pytest.mark.parametrize("place", ["msdgs_export.jobs.command.Sweep.run", "msdgs_export.jobs.command.write_scene"])
 def test_ctrl_c_leaves_old_files_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: str):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from export.importers.splats import ksplat, ply_fields, sog, splat, spz_container
+from msdgs_export.importers.splats import ksplat, ply_fields, sog, splat, spz_container
 from msdgs_serve import camera_path
 from msdgs_serve.scene.fields import FieldTable
 from msdgs_train.datasets.colmap.model import COLMAP_FIELDS

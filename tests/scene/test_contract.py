@@ -10,8 +10,8 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from export.bake import bake
-from export.plans.registry import build
+from msdgs_export.bake import bake
+from msdgs_export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import CONSTANT_OUTPUTS, MOVING_OUTPUTS, SceneMetadata
 from msdgs_serve.scene.errors import SceneFileInvalid

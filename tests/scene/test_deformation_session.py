@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from export.bake import bake
-from export.plans.registry import build
+from msdgs_export.bake import bake
+from msdgs_export.plans.registry import build
 from msdgs_serve import deformation
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput

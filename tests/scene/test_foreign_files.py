@@ -27,7 +27,7 @@ def zip_of(name: str) -> bytes:
 
 
 PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nend_header\n\0\0\0\0"
-IMPORTED = r"is a {}, not a scene file: `python export/to_onnx\.py [^`]*{}`"
+IMPORTED = r"is a {}, not a scene file: `msdgs-export [^`]*{}`"
 FILES = {
     "a.ply": (PLY, "splat"),
     "a.compressed.ply": (PLY, "splat"),

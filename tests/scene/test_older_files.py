@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.exporters.visionary import visionary_model
+from msdgs_export.exporters.visionary import visionary_model
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene import InvalidInput

@@ -103,7 +103,7 @@ def test_help_shows_examples_and_each_option_in_its_group(capsys: pytest.Capture
         main(["--help"])
     assert ended.value.code == 0
     text = capsys.readouterr().out
-    for part in ("msdgs-serve scene.onnx", "MSDGS_SCENES=", "export/to_onnx.py", "/docs"):
+    for part in ("msdgs-serve scene.onnx", "MSDGS_SCENES=", "msdgs-export", "/docs"):
         assert part in text
     parts = dict(re.findall(r"^(\S.*):\n((?:  .*\n)+)", text, re.MULTILINE))
     groups = {title: re.findall(r"^  --([\w-]+)", part, re.MULTILINE) for title, part in parts.items()}
@@ -120,7 +120,7 @@ def test_help_shows_examples_and_each_option_in_its_group(capsys: pytest.Capture
     [
         ([], "no scene given"),
         (["missing.onnx"], "missing.onnx, which does not exist"),
-        (["model.pt"], "export/to_onnx.py"),
+        (["model.pt"], "msdgs-export"),
         (["broken.onnx", "--port", "0"], "broken.onnx: `file`"),
         (["balls.onnx", "--port", "70000"], "--port: "),
         (["balls.onnx", "--max-pixels", "many"], "--max-pixels: "),

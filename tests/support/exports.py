@@ -1,15 +1,15 @@
-"""The parts of an export, put together as `to_onnx.py` does."""
+"""The parts of an export, put together as `msdgs-export` does."""
 
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from export.jobs.builder import CandidateBuilder
-from export.jobs.checkpoint import Checkpoint
-from export.jobs.ruler import Ruler
-from export.jobs.sweep import Sweep, SweepResult
-from export.pruning import RULES
-from export.target import Target
+from msdgs_export.jobs.builder import CandidateBuilder
+from msdgs_export.jobs.checkpoint import Checkpoint
+from msdgs_export.jobs.ruler import Ruler
+from msdgs_export.jobs.sweep import Sweep, SweepResult
+from msdgs_export.pruning import RULES
+from msdgs_export.target import Target
 from msdgs_train.gaussians.model import DynamicGaussians
 
 

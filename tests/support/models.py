@@ -8,12 +8,12 @@ from typing import Any
 
 import torch
 
-from export.bake import bake
-from export.jobs.verify import TIMES, TOLERANCE
-from export.jobs.write import Exported, write_scene
-from export.plans.base import BASELINE
-from export.plans.registry import build
-from export.precision.assess import assess
+from msdgs_export.bake import bake
+from msdgs_export.jobs.verify import TIMES, TOLERANCE
+from msdgs_export.jobs.write import Exported, write_scene
+from msdgs_export.plans.base import BASELINE
+from msdgs_export.plans.registry import build
+from msdgs_export.precision.assess import assess
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians

@@ -108,9 +108,9 @@ register_system(
 
 # export
 try:
-    from export.layers import LAYERS, LayerInputs
-    from export.layers.base import FieldLayerExport, zero
-    from export.layers.graph import GraphBuilder, to_numpy
+    from msdgs_export.layers import LAYERS, LayerInputs
+    from msdgs_export.layers.base import FieldLayerExport, zero
+    from msdgs_export.layers.graph import GraphBuilder, to_numpy
 except ImportError:  # training needs neither `export` nor onnx
     pass
 else:

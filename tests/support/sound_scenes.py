@@ -6,11 +6,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from export.bake import bake
-from export.importers.sequence import Frames, sequence_scene
-from export.plans.registry import build
-from export.storage.choice import COARSEST, GROUPS, packed
-from export.trajectories.sampling import Trajectories
+from msdgs_export.bake import bake
+from msdgs_export.importers.sequence import Frames, sequence_scene
+from msdgs_export.plans.registry import build
+from msdgs_export.storage.choice import COARSEST, GROUPS, packed
+from msdgs_export.trajectories.sampling import Trajectories
 from tests.support.models import NODES, SCENE, random_model
 from tests.support.scene_files import write_scene
 from tests.support.splat_files import some_gaussians

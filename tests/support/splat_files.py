@@ -13,7 +13,7 @@ import numpy as np
 import OpenImageIO as oiio
 import zstandard
 
-from export.exporters.spz import write_spz
+from msdgs_export.exporters.spz import write_spz
 from msdgs_serve.rasterizer import rasterize
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.gaussians import Gaussians

@@ -1,0 +1,1 @@
+"""Export of trained models to scene files, and conversion from and to other formats."""

@@ -1,0 +1,77 @@
+"""Detection of the format of a file or folder by its contents, or by its name if the contents don't tell."""
+
+import re
+import zipfile
+from pathlib import Path
+
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.runs.model import RUNS, run_format
+from msdgs_export.importers.splats.formats import READERS, splat_format
+from msdgs_serve.scene.errors import InvalidInput
+
+FORMATS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *RUNS)
+"""All inputs: our own model.pt, one set of Gaussians, a folder of them, and runs of other trainers."""
+
+FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat", ".ply.gz")
+
+
+def detect_format(path: Path) -> str:
+    """The format of `path`, one of `FORMATS`. Raises `ImportFailed` listing the formats if it is none."""
+    if not path.exists():
+        raise ImportFailed(path, "no such file or folder")
+    try:
+        found = splat_format(path) or (_folder(path) if path.is_dir() else _model(path))
+    except OSError as error:
+        raise ImportFailed(path, f"can't be read: {error.strerror or error}") from error
+    if found is None and path.suffix.lower() == ".onnx":
+        raise ImportFailed(path, "is a scene file already; msdgs-convert writes it as other formats")
+    if found is None:
+        raise ImportFailed(path, f"has no known format; --format names it, one of {', '.join(FORMATS)}")
+    return found
+
+
+def checked_format(text: str) -> str:
+    """One of `FORMATS`. Raises `InvalidInput` for anything else."""
+    if text not in FORMATS:
+        raise InvalidInput("format", f"detect or one of {', '.join(FORMATS)}", repr(text))
+    return text
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """The splat files of a folder in the order of the number in their names.
+
+    Raises `ImportFailed` naming two whose names differ in anything else: they are separate scenes, not frames.
+    """
+    if not folder.is_dir():
+        raise ImportFailed(folder, "isn't a folder of frames")
+    files = sorted(f for f in folder.iterdir() if f.name.lower().endswith(FRAMES) and not f.name.startswith("."))
+    if len(files) < 2:
+        return files
+    names = [_name_and_numbers(file) for file in files]
+    place = max((i for i in range(1, min(map(len, names[:2])), 2) if names[0][i] != names[1][i]), default=0)
+    for file, name in zip(files[1:], names[1:], strict=True):
+        if not place or name[:place] + name[place + 1 :] != names[0][:place] + names[0][place + 1 :]:
+            problem = f"{files[0].name} and {file.name} differ in more than a number"
+            raise ImportFailed(folder, f"its splat files aren't frames of one sequence: {problem}")
+    return sorted(files, key=lambda file: (int(_name_and_numbers(file)[place]), file.name))
+
+
+def _name_and_numbers(file: Path) -> list[str]:
+    """The name split into text at even indices and numbers at odd ones; the last text includes the suffix."""
+    parts = re.split(r"([0-9]+)", file.stem)
+    return [*parts[:-1], f"{parts[-1]}{file.suffix.lower()}"]
+
+
+def _model(path: Path) -> str | None:
+    if path.suffix.lower() in (".pt", ".pth"):
+        return "model"
+    if not zipfile.is_zipfile(path):
+        return None
+    with zipfile.ZipFile(path) as archive:
+        return "model" if any(name.endswith("/data.pkl") for name in archive.namelist()) else None
+
+
+def _folder(path: Path) -> str | None:
+    if (path / "model.pt").is_file():
+        return "model"
+    return run_format(path) or ("sequence" if len(frame_files(path)) > 1 else None)

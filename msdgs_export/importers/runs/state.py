@@ -1,0 +1,87 @@
+"""The networks and settings of another trainer's run, read without running any code in its files."""
+
+import ast
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.guard import read_guarded
+from msdgs_train.gaussians.model_file import CheckpointInvalid, load, refuse_unlike_stored
+
+
+class State:
+    """The finite tensors of a torch file by name, as float32."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self._values = {name: torch.from_numpy(array) for name, array in read_guarded(read_network, file).items()}
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._values
+
+    def names(self) -> list[str]:
+        return list(self._values)
+
+    def read(self, name: str, *shape: int | None) -> Tensor:
+        """A tensor. Raises `ImportFailed` if it is missing or has another shape; None is any size."""
+        if name not in self._values:
+            raise ImportFailed(self.file, f"lacks `{name}`")
+        tensor = self._values[name]
+        fits = len(shape) == tensor.ndim and all(s is None or s == n for s, n in zip(shape, tensor.shape, strict=True))
+        if not fits:
+            expected = " × ".join("any" if s is None else str(s) for s in shape)
+            raise ImportFailed(self.file, f"`{name}` has shape {tuple(tensor.shape)}, not {expected}")
+        return tensor
+
+    def fill(self, linear: nn.Module, name: str) -> None:
+        """Set weight and bias of a Linear to those stored under `name`."""
+        for kind in ("weight", "bias"):
+            parameter = linear.get_parameter(kind)
+            parameter.copy_(self.read(f"{name}.{kind}", *parameter.shape))
+
+
+def read_network(file: Path) -> dict[str, np.ndarray]:
+    """Read the tensors, in a subprocess. Takes no more memory than a small multiple of the file's size.
+
+    Raises `ImportFailed`.
+    """
+    try:
+        values = load(file)
+        if not isinstance(values, Mapping) or not all(isinstance(v, Tensor) for v in values.values()):
+            raise ImportFailed(file, "isn't the state of a network: tensors by name")
+        refuse_unlike_stored(file, values)
+    except CheckpointInvalid as error:
+        raise ImportFailed(file, str(error).removeprefix(f"{file}: ")) from error
+    for name, tensor in values.items():
+        if not torch.isfinite(tensor).all():
+            raise ImportFailed(file, f"`{name}` holds NaN or infinity")
+    return {str(name): tensor.detach().to(torch.float32).numpy() for name, tensor in values.items()}
+
+
+class RunFolder:
+    """One iteration of a run: its networks and the plain values of its cfg_args."""
+
+    def __init__(self, folder: Path, iteration: int, networks: str) -> None:
+        """`networks` is their path in the folder, with `*` for the iteration."""
+        name = networks.replace("*", str(iteration))
+        if not (folder / name).is_file():
+            raise ImportFailed(folder, f"has point_cloud/iteration_{iteration} but no {name}")
+        self.state = State(folder / name)
+        self.settings = _settings(folder / "cfg_args")
+
+
+def _settings(file: Path) -> dict[str, Any]:
+    """The plain values of cfg_args, the text of a Namespace; it isn't executed."""
+    try:
+        call = ast.parse(file.read_text(), mode="eval").body
+    except FileNotFoundError:
+        return {}
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise ImportFailed(file, f"can't be read: {error}") from error
+    keywords = call.keywords if isinstance(call, ast.Call) else ()
+    return {str(k.arg): k.value.value for k in keywords if isinstance(k.value, ast.Constant)}

@@ -1,0 +1,83 @@
+"""The properties of an element of a PLY by name."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from msdgs_export.importers.errors import ImportFailed
+from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
+from msdgs_train.datasets.common.ply_file import PlyFile, PlyInvalid
+
+PREFIX = re.compile(r"(scalar_)+", re.IGNORECASE)
+"""CloudCompare's, before the names of all properties but positions, normals and colors."""
+
+
+class Columns:
+    """The properties of one element. Raises `ImportFailed`, also for a property that is missing when it is read."""
+
+    def __init__(self, file: Path, contents: PlyFile, element: str) -> None:
+        try:
+            self._data = contents.read(element)
+        except PlyInvalid as error:
+            raise ImportFailed(file, str(error)) from None
+        self._file, self._element = file, element
+        stored = self._data.dtype.names or ()
+        plain = {each: PREFIX.sub("", each, count=1) if PREFIX.match(each) else each for each in stored}
+        self._stored = {name: each for each, name in plain.items()} | {
+            each: each for each in stored if plain[each] == each
+        }
+        self.rows = len(self._data)
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._stored)
+
+    def has(self, *names: str) -> bool:
+        return all(name in self._stored for name in names)
+
+    def read(self, name: str) -> np.ndarray:
+        """One column as float64."""
+        with np.errstate(invalid="ignore"):  # signaling NaN in damaged files
+            return self._column(name).astype(np.float64)
+
+    def packed(self, name: str) -> np.ndarray:
+        """A column of 32 bits."""
+        column = self._column(name)
+        if column.dtype.kind != "u" or column.dtype.itemsize != 4:
+            raise ImportFailed(self._file, f"`{name}` is {column.dtype}, not uint")
+        return column.astype(np.uint32)
+
+    def fraction(self, name: str) -> np.ndarray:
+        """A column as float64; integers are divided by the largest of their type."""
+        kind = self._column(name).dtype
+        return self.read(name) / (1.0 if kind.kind == "f" else np.iinfo(kind).max)
+
+    def named(self, *names: str) -> np.ndarray:
+        return np.stack([self.read(name) for name in names], axis=1)
+
+    def stack(self, prefix: str, count: int) -> np.ndarray:
+        """[N, count] of numbered columns."""
+        return self.named(*(f"{prefix}{i}" for i in range(count)))
+
+    def count(self, prefix: str) -> int:
+        """The number of columns that are a prefix and a number."""
+        return sum(re.fullmatch(prefix + r"[0-9]+", name) is not None for name in self.names)
+
+    def _column(self, name: str) -> np.ndarray:
+        if not self.has(name):
+            content = "a cloud of points without Gaussians" if not self.has("opacity") else "not a whole splat"
+            raise ImportFailed(self._file, f"`{self._element}` has no property `{name}`; it is {content}")
+        return np.asarray(self._data[self._stored[name]])
+
+
+def rest_of(file: Path, columns: Columns, read: Callable[[str], np.ndarray]) -> np.ndarray:
+    """[N, C − 1, 3] SH above degree 0, from columns that are sorted by channel."""
+    count = columns.count("f_rest_")
+    if count % 3 or count // 3 + 1 not in SH_DEGREES:
+        raise ImportFailed(file, f"has {count} of `f_rest_…`; 0, 9, 24 or 45 make whole degrees")
+    if not count:
+        return np.empty((columns.rows, 0, 3))
+    values = [read(f"f_rest_{i}") for i in range(count)]
+    return np.stack(values, axis=1).reshape(columns.rows, 3, count // 3).transpose(0, 2, 1)

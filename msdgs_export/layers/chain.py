@@ -1,0 +1,59 @@
+"""A chain of layers as part of a graph (equations 7 to 9)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from msdgs_export.layers import export_of
+from msdgs_export.layers.base import HEADS, LayerInputs, heads_of
+from msdgs_export.layers.graph import GraphBuilder
+from msdgs_train.layers.base import DeformationLayer
+
+STRETCH_COLUMNS = 6
+"""Columns of a symmetric matrix, in which control nodes sum stretches; the first three are its diagonal."""
+
+
+def used_heads(layers: Sequence[DeformationLayer]) -> list[str]:
+    """Heads that change anything in any of the layers; at least one."""
+    inert = [export_of(layer).inert_heads(layer) for layer in layers]
+    return [head for head in heads_of(layers[0]).columns if any(head not in heads for heads in inert)] or ["means"]
+
+
+def summed_deltas(
+    graph: GraphBuilder,
+    layers: Sequence[DeformationLayer],
+    points: str,
+    time: str,
+    steps: str,
+    used: list[str],
+    num_nodes: int | None = None,
+) -> dict[str, str]:
+    """Deltas of points, [P, 3], by head; on control nodes scales have six columns."""
+    widths = {name: columns.stop - columns.start for name, columns in heads_of(layers[0]).columns.items()}
+    widths |= {} if num_nodes is None else {"scales": STRETCH_COLUMNS}
+    total, moved, parts = "", points, dict[str, str]()
+    for k, layer in enumerate(layers, start=1):
+        name, export = f"layer{k}", export_of(layer)
+        step = export.deltas(graph, LayerInputs(name, layer, moved, time, _gate(graph, name, steps, k)), used)
+        if num_nodes is not None and export.scale_columns != STRETCH_COLUMNS:
+            step = _padded(graph, name, step, num_nodes)
+        total = graph.node("Add", [total, step], f"{name}.deltas") if total else step
+        sizes = [widths[head] for head in used]
+        parts = dict(zip(used, graph.split(total, [f"{name}.{head}" for head in used], sizes), strict=True))
+        if k < len(layers) and "means" in parts:
+            moved = graph.node("Add", [points, parts["means"]], f"{name}.moved")
+    return parts
+
+
+def _padded(graph: GraphBuilder, name: str, step: str, num_nodes: int) -> str:
+    """Deltas of all heads, [P, 10], with zeros for the off-diagonal columns of scales, [P, 13]."""
+    parts = graph.split(step, [f"{name}.raw.{head}" for head in HEADS], [3, 3, 4])
+    zeros = graph.constant(f"{name}.off_diagonal", np.zeros((num_nodes, 3), np.float32))
+    return graph.node("Concat", [parts[0], parts[1], zeros, parts[2]], f"{name}.padded", axis=1)
+
+
+def _gate(graph: GraphBuilder, name: str, steps: str, k: int) -> str:
+    """[1] fraction of layer k that is applied if `steps` layers are, in [0, 1]."""
+    before = graph.constant(f"{name}.before", np.array([k - 1], np.float32))
+    limits = [graph.constant(f"{name}.gate.{n}", np.array(v, np.float32)) for n, v in (("min", 0), ("max", 1))]
+    return graph.node("Clip", [graph.node("Sub", [steps, before], f"{name}.steps"), *limits], f"{name}.gate")
