@@ -2,7 +2,7 @@
 
 import sys
 
-from msdgs_serve.process import begin
+from msdgs_serve.process import EXIT_INVALID, begin
 
 
 def main() -> int:
@@ -14,7 +14,7 @@ def main() -> int:
         print(
             f"msdgs-train needs {error.name}, which serving alone does not: pip install 'msdgs[train]'", file=sys.stderr
         )
-        return 2
+        return EXIT_INVALID
     return main()
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.progress import BarColumn, MofNCompleteColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from msdgs_serve.process import EXIT_INTERRUPTED
+from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.cli.console import EXIT_INVALID, console, progress_bar
+from msdgs_train.cli.console import console, progress_bar
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_systems
 from msdgs_train.comparison.scenes import read_scenes
 from msdgs_train.settings import optional

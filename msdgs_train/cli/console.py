@@ -1,4 +1,4 @@
-"""The console, exit codes, tables and progress bars that commands share."""
+"""The console, tables and progress bars that commands share."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from rich.console import Console
 from rich.progress import Progress, ProgressColumn
 from rich.table import Table
-
-EXIT_INVALID = 2
 
 console = Console(markup=False)  # names of files may have brackets
 

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import tyro
 from rich.console import Console
 
-from msdgs_serve.process import EXIT_INTERRUPTED
+from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.writing import in_words
 from msdgs_train.cli.compare import Compare
-from msdgs_train.cli.console import EXIT_INVALID
 from msdgs_train.cli.evaluate import Eval
 from msdgs_train.cli.fit import Fit, parse_fit
 from msdgs_train.cli.steps import Steps
