@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from msdgs_export.exporters.upright import upright, upright_offset
 from msdgs_export.importers.scene import UP
-from msdgs_export.importers.splats.axes import from_right_up_back, upright, upright_offset
+from msdgs_export.importers.splats.axes import from_right_up_back
 from msdgs_export.importers.splats.base import as_float32
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians

@@ -9,11 +9,12 @@ import tyro
 from rich.console import Console
 
 from msdgs_export.exporters.gltf import write_gltf
+from msdgs_export.exporters.upright import upright
 from msdgs_export.importers.command import model_or_import
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.scene import static_scene
 from msdgs_export.importers.sequence import read_sequence, sequence_scene
-from msdgs_export.importers.splats.axes import up_direction, upright
+from msdgs_export.importers.splats.axes import up_direction
 from msdgs_export.importers.splats.base import Splats
 from msdgs_export.importers.splats.formats import read_splats
 from msdgs_export.importers.splats.ply import read_ply

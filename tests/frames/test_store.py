@@ -145,7 +145,7 @@ def test_only_names_of_scenes_open_anything(folder: Path, tmp_path: Path, name: 
     ("name", "hint"),
     [
         ("nothing.onnx", "does not exist"),
-        ("model.pt", "to_onnx"),
+        ("model.pt", "msdgs-export"),
         ("a.txt", "a.txt"),
         ("a\\b.onnx", "unhidden names"),
         ("other/walk.onnx", "different names"),

@@ -48,7 +48,7 @@ def environment(tmp_path_factory: pytest.TempPathFactory) -> Path:
         pytest.skip(f"no package index can be reached: {installed.stderr.strip().splitlines()[-1]}")
     assert installed.returncode == 0, installed.stdout + installed.stderr
     (site,) = folder.glob("lib/python*/site-packages")
-    for compiled in ROOT.glob("msdgs_serve/**/__pycache__/*.nb[ic]"):  # another test compiles them from nothing
+    for compiled in ROOT.glob("msdgs_*/**/__pycache__/*.nb[ic]"):  # another test compiles them from nothing
         copy = site / compiled.relative_to(ROOT)
         copy.parent.mkdir(exist_ok=True)
         shutil.copy(compiled, copy)

@@ -12,12 +12,19 @@ from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.guard import read_guarded
 from msdgs_export.importers.splats.base import Splats
 from msdgs_export.importers.splats.ksplat import read_ksplat
-from msdgs_export.importers.splats.ply import read_ply
 from msdgs_export.importers.splats.sog import LEVELS, META, ZIP_PROBLEMS, read_sog, refused_levels
 from msdgs_export.importers.splats.splat import read_splat
 from msdgs_export.importers.splats.spz import read_spz
 from msdgs_export.importers.splats.unpack import GZIP, OTHERS, ZIP, gzip_start, splat_in_zip, unpack
 from msdgs_serve.scene.foreign import LFS_POINTER, START_BYTES, is_lfs_pointer
+
+
+def read_ply(path: Path) -> Splats:
+    """`ply.read_ply`, imported when it is called: it imports numba, which takes longer than to read most files."""
+    from msdgs_export.importers.splats import ply
+
+    return ply.read_ply(path)
+
 
 READERS: dict[str, Callable[[Path], Splats]] = {
     "ply": read_ply,
