@@ -124,8 +124,8 @@ def test_it_trains_exports_and_converts(environment: Path, tmp_path: Path) -> No
 
     run("python", "-c", f"import msdgs_export as m; assert m.__file__.startswith({str(environment)!r})")
     run("msdgs-train", "synthetic", "data", "--size", "16", "--train-frames", "4", "--test-frames", "2")
-    run("msdgs-train", "fit", "data", "run", "--steps", "20")
-    run("msdgs-export", "run/model.pt", "--quick", "--output", "scene.onnx")
+    run("msdgs-train", "fit", "data", "run", "--steps", "5", "--init-num-pts", "100")
+    run("msdgs-export", "run/model.pt", "--quick", "--times", "2", "--output", "scene.onnx")
     run("msdgs-convert", "scene.onnx", "scene.ply")
     run("msdgs-render", "scene.onnx", "frames", "--frames", "2", "--width", "24", "--height", "16")
     frames = [decode(file.read_bytes(), "png")[0] for file in sorted((tmp_path / "frames").glob("*.png"))]
