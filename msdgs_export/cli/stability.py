@@ -54,4 +54,4 @@ def main(
 
 def command() -> int:
     """Run the command line; returns the exit status."""
-    return tyro.cli(main, config=(tyro.conf.FlagConversionOff,))
+    return tyro.cli(main)
