@@ -8,9 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.settings import optional
+from msdgs_train.settings import Flag, optional
 
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 Kept = Literal["heads", "modulation", "layers", "invisible", "static", "sh", "float32"]
 """The rules of pruning, and float32."""
 

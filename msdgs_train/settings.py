@@ -1,13 +1,16 @@
-"""Checks that all groups of settings share."""
+"""What groups of settings and commands share: how the help shows options, and checks."""
 
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
 from msdgs_serve.scene.errors import InvalidInput
+
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
+"""An option without a value, off unless it is given."""
 
 
 def optional(metavar: str, aliases: list[str] | None = None) -> Any:

@@ -58,6 +58,8 @@ class Scaling:
     """Simulated requests."""
     replicas: tuple[int, ...] = (1, 3, 10, 30, 100, 300, 1000)
     """Simulated numbers of replicas."""
+    check: bool = False
+    """Test this benchmark: laws of the simulation and a small measurement."""
 
 
 class Frame(NamedTuple):
@@ -151,6 +153,8 @@ def extrapolate(options: Scaling, measured: Measured, pose_bytes: int) -> None:
 
 def main(options: Scaling) -> int:
     """Measure, compare with the simulation, extrapolate."""
+    if options.check:
+        return check()
     print(f"{machine()}; {options.scene.name}, {options.size} × {options.size}, {options.frames} frames")
     scene, trace = DeformationSession(options.scene).scene, zipf_trace(options.frames, SCENES, TIMES)
     pose_bytes = 40 * len(scene)
@@ -170,6 +174,26 @@ def main(options: Scaling) -> int:
         print("the simulation differs too much from the measurement; nothing is extrapolated", file=sys.stderr)
         return 1
     extrapolate(options, measured, pose_bytes)
+    return 0
+
+
+def check() -> int:
+    """A cache that holds all misses once per pose, affinity adds caches up, a full queue refuses; then a small run."""
+    trace, one = zipf_trace(2000, SCENES, TIMES), Stages(np.array([0.01]), np.array([0.02]))
+    distinct = len(set(zip(*(column.tolist() for column in trace), strict=True)))
+    alone = simulate(trace, Fleet(1, poses=SCENES * TIMES), one, clients=1)
+    assert (alone.hits, alone.refused) == (2000 - distinct, 0)
+    assert abs(alone.seconds - 0.01 * (2000 + distinct)) < 1e-6
+    affinity, round_robin = (
+        simulate(trace, Fleet(3, r, poses=40), one, clients=6) for r in ("affinity", "round robin")
+    )
+    assert affinity.hit_rate > round_robin.hit_rate
+    flooded = simulate(trace, Fleet(1, poses=40), one, rate=500)
+    assert flooded.refused > 500
+    assert flooded.latencies.max() <= 17 * 0.02 + 1e-9
+    small = Scaling(size=32, frames=40, repeats=1, requests=500, replicas=(1, 3))
+    extrapolate(small, Measured(one, 100.0, 0.5, 1e4), pose_bytes=400_000)
+    assert main(small) in (0, 1)  # on a busy machine the simulated rate may differ
     return 0
 
 

@@ -16,7 +16,7 @@ def main(
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")],
     json: Annotated[Path | None, optional("PATH")] = None,
     times: int = 20,
-    min_psnr: float = 50.0,
+    min_psnr: Annotated[float, tyro.conf.arg(metavar="DB")] = 50.0,
 ) -> int:
     """Measure how stable a trained model's deformation is in float32.
 
@@ -54,4 +54,4 @@ def main(
 
 def command() -> int:
     """Run the command line; returns the exit status."""
-    return tyro.cli(main, config=(tyro.conf.FlagConversionOff,))
+    return tyro.cli(main)

@@ -115,7 +115,9 @@ def _modules(file: Path) -> tuple[Any, ...]:
     try:
         from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
     except ModuleNotFoundError:
-        raise InvalidInput("out", "another format, or pip install '.[usd]'", f"{file.name} without OpenUSD") from None
+        raise InvalidInput(
+            "out", "another format, or pip install 'msdgs[usd]'", f"{file.name} without OpenUSD"
+        ) from None
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise InvalidInput("out", "another format, or OpenUSD 26.3 or later", f"{file.name} with an older version")
     return Usd, UsdVol, UsdGeom, Vt, Gf

@@ -10,7 +10,8 @@ from msdgs_export.jobs.pruned_models import PrunedModels, exact_in_float32
 from msdgs_export.jobs.ruler import Ruler
 from msdgs_export.jobs.samples import SharedTrajectories
 from msdgs_export.plans.registry import build, check_appearance, plan_of
-from msdgs_export.precision.assess import StabilityReport, assess
+from msdgs_export.precision.assess import assess
+from msdgs_export.precision.report import StabilityReport
 from msdgs_export.pruning import RULES
 from msdgs_export.pruning.mask import with_layers, with_sh_degree
 from msdgs_export.target import Target

@@ -99,7 +99,9 @@ def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutIma
     try:
         from msdgs_export.measure.images import HeldOutImages  # needs the trainer's readers of datasets
     except ModuleNotFoundError as error:
-        raise InvalidInput("data", "left out, or pip install '.[train,export]'", f"no module {error.name}") from None
+        raise InvalidInput(
+            "data", "left out, or pip install 'msdgs[train,export]'", f"no module {error.name}"
+        ) from None
     return HeldOutImages(data, load_model(model).scene, lambda count: track("images", count))
 
 

@@ -101,7 +101,7 @@ class StabilityReport:
             return "; ".join(self.broken)
         if self.unstable and not plan_of(plan).fitted:
             problem = "; ".join(self.unstable)
-            return f"the plan `{plan}` computes the layers in float32 or less, and {problem}; use {_remedy()}"
+            return f"the plan `{plan}` computes the layers in float32, and {problem}; use {_remedy()}"
         return None
 
     def require(self, plan: str) -> None:

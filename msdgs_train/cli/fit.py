@@ -18,6 +18,7 @@ from msdgs_train.cli.console import console
 from msdgs_train.cli.parts import PARTS
 from msdgs_train.cli.view import open_viewer
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.settings import Flag
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
 HELP_ALL = "--help-all"
@@ -30,7 +31,6 @@ COMMON = {
 """Settings that --help shows, by group; --help-all shows all."""
 RARE = ("viewer_port", "viewer_host")
 """Options of the command that only --help-all shows."""
-Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff, tyro.conf.arg(help_behavior_hint="")]
 
 
 @dataclass(frozen=True)

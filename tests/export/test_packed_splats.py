@@ -156,5 +156,5 @@ def test_faults_of_a_zip_are_told_in_words_of_ours(
 def test_zstandard_is_needed_by_spz_4_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "zstandard", None)
     assert len(read_splats(write_splats(tmp_path, "spz 3, bare", G)).gaussians) == len(G)
-    with pytest.raises(ImportFailed, match=r"SPZ version 4, which needs zstandard: pip install '\.\[export\]'"):
+    with pytest.raises(ImportFailed, match=r"SPZ version 4, which needs zstandard: pip install 'msdgs\[export\]'"):
         read_splats(write_splats(tmp_path, "spz 4", G))

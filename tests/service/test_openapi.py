@@ -21,7 +21,7 @@ from tests.support.fuzzing import CASES, SEED
 from tests.support.scene_files import write_scene
 from tests.support.service import FRAME, MAX_SECONDS, ORBIT, check_problem, serving
 
-HEALTHY = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.function_scoped_fixture]
+SUPPRESSED = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.function_scoped_fixture]
 ALLOWED = {501, 503, 504, 507}
 JSON = {"Content-Type": "application/json"}
 HUGE, DEEP, DEEPER = "@huge@", "@deep@", "@deeper@"
@@ -120,7 +120,7 @@ def test_every_call_answers_as_the_document_says(client: httpx.Client):
     assert len(every) == 12
     for operation in every:
 
-        @settings(suppress_health_check=HEALTHY)
+        @settings(suppress_health_check=SUPPRESSED)
         @given(case=operation.as_strategy())
         def check(case: schemathesis.Case) -> None:
             # JSON Schema can't express times and cameras of a scene, nor combinations of fields
@@ -130,7 +130,7 @@ def test_every_call_answers_as_the_document_says(client: httpx.Client):
 
 
 @pytest.mark.slow
-@settings(suppress_health_check=HEALTHY)
+@settings(suppress_health_check=SUPPRESSED)
 @given(content=st.binary(max_size=300))
 def test_random_bytes_are_refused(client: httpx.Client, content: bytes):
     response = client.post("/render", content=content, headers=JSON)

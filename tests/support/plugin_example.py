@@ -111,7 +111,7 @@ try:
     from msdgs_export.layers import LAYERS, LayerInputs
     from msdgs_export.layers.base import FieldLayerExport, zero
     from msdgs_export.layers.graph import GraphBuilder, to_numpy
-except ImportError:  # training needs neither `export` nor onnx
+except ImportError:  # training needs no onnx
     pass
 else:
 

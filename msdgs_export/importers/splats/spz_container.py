@@ -195,7 +195,7 @@ def _zstd(file: Path, number: int, packed: bytes, size: int) -> bytes:
     try:
         import zstandard
     except ModuleNotFoundError:
-        raise ImportFailed(file, "is SPZ version 4, which needs zstandard: pip install '.[export]'") from None
+        raise ImportFailed(file, "is SPZ version 4, which needs zstandard: pip install 'msdgs[export]'") from None
     try:
         stated = zstandard.frame_content_size(packed)
         if stated not in (-1, size):
