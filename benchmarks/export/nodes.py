@@ -21,8 +21,8 @@ from benchmarks.measuring import Times, machine, report_console, table
 from msdgs_export.jobs.builder import CandidateBuilder
 from msdgs_export.jobs.candidate import Measured
 from msdgs_export.jobs.checkpoint import Checkpoint
+from msdgs_export.jobs.packing import stored
 from msdgs_export.jobs.ruler import Ruler
-from msdgs_export.jobs.store import stored
 from msdgs_export.jobs.verify import TIMES, verify
 from msdgs_export.jobs.write import properties
 from msdgs_export.measure.poses import posed

@@ -17,7 +17,7 @@ from msdgs_export.exporters.visionary import visionary_model
 from msdgs_export.exporters.visionary_scene import visionary_scene
 from msdgs_export.importers.sequence import of_the_moment
 from msdgs_export.importers.splats.formats import read_splats
-from msdgs_export.jobs.store import stored_anew
+from msdgs_export.jobs.packing import stored_anew
 from msdgs_export.jobs.write import set_properties, storage_differences, write_measured
 from msdgs_export.options import ConvertOptions, require_folder_of
 from msdgs_export.plans.registry import PLANS

@@ -11,7 +11,7 @@ import onnx
 from msdgs_export.bake import Baked, Moving
 from msdgs_export.importers.placement import placement
 from msdgs_export.importers.splats.base import Splats
-from msdgs_export.jobs.store import stored_anew
+from msdgs_export.jobs.packing import stored_anew
 from msdgs_export.jobs.write import properties, set_properties, storage_differences, write_measured
 from msdgs_export.measure.poses import half_diagonal
 from msdgs_export.plans.base import BASELINE

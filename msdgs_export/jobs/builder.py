@@ -8,7 +8,7 @@ from msdgs_export.jobs.candidate import Candidate
 from msdgs_export.jobs.checkpoint import Checkpoint
 from msdgs_export.jobs.pruned_models import PrunedModels, exact_in_float32
 from msdgs_export.jobs.ruler import Ruler
-from msdgs_export.jobs.samples import SharedTrajectories
+from msdgs_export.jobs.shared_trajectories import SharedTrajectories
 from msdgs_export.plans.registry import build, check_appearance, plan_of
 from msdgs_export.precision.assess import assess
 from msdgs_export.precision.report import StabilityReport

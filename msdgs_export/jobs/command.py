@@ -13,11 +13,11 @@ from rich.table import Column, Table
 from msdgs_export.jobs.builder import CandidateBuilder
 from msdgs_export.jobs.candidate import Measured
 from msdgs_export.jobs.checkpoint import Checkpoint
+from msdgs_export.jobs.packing import stored
 from msdgs_export.jobs.planned import planned
 from msdgs_export.jobs.points import as_stored
 from msdgs_export.jobs.report import COLUMNS, gain, report, rows, write_report
 from msdgs_export.jobs.ruler import Ruler
-from msdgs_export.jobs.store import stored
 from msdgs_export.jobs.sweep import Sweep
 from msdgs_export.jobs.write import Exported, write_scene
 from msdgs_export.options import ExportOptions

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import onnx
 
 from msdgs_export.jobs.candidate import Candidate, Measured, usable
+from msdgs_export.jobs.packing import METADATA_BYTES, finest
 from msdgs_export.jobs.ruler import Ruler
-from msdgs_export.jobs.store import METADATA_BYTES, finest
 from msdgs_export.storage.choice import COARSEST, packed
 from msdgs_export.target import Target, TargetNotReached
 

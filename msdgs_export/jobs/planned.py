@@ -6,9 +6,9 @@ from contextlib import suppress
 from msdgs_export.jobs.builder import CandidateBuilder
 from msdgs_export.jobs.candidate import UNUSABLE, Candidate, Measured
 from msdgs_export.jobs.fit_bytes import within_bytes
+from msdgs_export.jobs.packing import METADATA_BYTES
 from msdgs_export.jobs.pruned_models import pruning_levels
 from msdgs_export.jobs.ruler import Ruler
-from msdgs_export.jobs.store import METADATA_BYTES
 from msdgs_export.target import Target, squared
 
 PRUNING_PARTS = (1.0, 0.5, 0.25)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from msdgs_export.bake import Baked
-from msdgs_export.jobs import pruned_models, samples
+from msdgs_export.jobs import pruned_models, shared_trajectories
 from msdgs_export.jobs.candidate import Candidate
 from msdgs_export.jobs.ruler import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES
 from msdgs_export.jobs.write import write_scene
@@ -73,7 +73,7 @@ def test_trajectories_are_those_of_the_pruned_model(
 
     monkeypatch.setattr(pruned_models, "ROUND_OFF_DB", MAX_PSNR if float32 == "not exact enough" else 0.0)
     if float32 == "overflows":  # at times that stability didn't try
-        monkeypatch.setattr(samples.SinglePoses, "at", overflow)
+        monkeypatch.setattr(shared_trajectories.SinglePoses, "at", overflow)
         monkeypatch.setattr(DeformationSession, "gaussians", overflow)
     made = list[tuple[Baked, Trajectories, bool]]()
 
@@ -82,7 +82,7 @@ def test_trajectories_are_those_of_the_pruned_model(
         made.append((baked, Trajectories(baked, *args), not with_sampler))
         return made[-1][1]
 
-    monkeypatch.setattr(samples, "Trajectories", trajectories)
+    monkeypatch.setattr(shared_trajectories, "Trajectories", trajectories)
     exported(tmp_path, with_hidden_one(moving_object()), rules=rules).builder.candidate("compact:40", 50.0)
     ((baked, got, in_float64),) = made
     assert in_float64 == (float32 != "exact")
