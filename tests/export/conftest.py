@@ -20,7 +20,7 @@ def few_candidates() -> Iterator[None]:
             ("pruned_models.SELECTION_CAMERAS", 1),
             ("ruler.EVALUATION_TIMES", 6),
             ("builder.STABILITY_TIMES", 3),
-            ("store.EVALUATION_TIMES", 6),
+            ("packing.EVALUATION_TIMES", 6),
             ("timing.REPEATS", 3),
         ):
             patch.setattr(f"msdgs_export.jobs.{name}", value)
