@@ -63,7 +63,8 @@ class Run:
     folder: Path
     config: TrainConfig
     settings: str
-    """Eight digits that change with any setting of the system and the command besides the budget's time and threads."""
+    """Eight digits that change with any setting of the system, the scene and the command besides the budget's time and
+    threads."""
     splits: tuple[str, ...] = SPLITS
     """Held-out images whose metrics are reported."""
 
@@ -92,16 +93,17 @@ def make_runs(
     require_unique("seed", map(str, seeds))
     return [
         Run(name, scene.name, seed, scene.folder, out / name / f"{scene.name}_{seed}",
-            config.updated(seed=seed, **scene.settings), _digest(config), scene.splits)
+            config.updated(seed=seed, **scene.settings), _digest(config, scene), scene.splits)
         for seed in seeds
         for scene in scenes
         for name, config in systems.items()
     ]  # fmt: skip
 
 
-def _digest(config: TrainConfig) -> str:
-    same = config.updated(seed=0, minutes=None, threads=1, time="wall")
-    return hashlib.sha256(json.dumps(same.to_dict(), sort_keys=True).encode()).hexdigest()[:8]
+def _digest(config: TrainConfig, scene: Scene) -> str:
+    same = config.updated(seed=0, minutes=None, threads=1, time="wall").to_dict()
+    values = [same, dict(scene.settings), scene.splits]
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:

@@ -168,6 +168,19 @@ def test_a_row_is_of_the_budget_and_of_all_settings(data: Path) -> None:
     assert [run.settings == known.settings for run in changed] == [True, True, True, False, False, False]
 
 
+def test_a_row_is_of_the_scenes_own_settings(tmp_path: Path) -> None:
+    (tmp_path / "toys").mkdir()
+    rows = ["", "size = 9", "llffhold = 4", 'time_from = "index"', 'splits = ["val"]']
+
+    def settings(row: str) -> str:
+        (tmp_path / "scenes.toml").write_text(f'[toys]\nfolder = "toys"\n{row}\n')
+        (run,) = make_runs({"a": preset("static")}, read_scenes([tmp_path / "scenes.toml"]), [0], tmp_path / "out")
+        return run.settings
+
+    assert len({settings(row) for row in rows}) == len(rows)
+    assert settings(rows[1]) == settings(rows[1])
+
+
 def test_the_length_of_a_run_is_steps_or_minutes() -> None:
     config = preset("msdgs-nodes")
     assert Budget().of(config).run.steps == 3000
