@@ -17,6 +17,7 @@ from msdgs_export.bake import Baked
 from msdgs_export.layers.graph import GraphBuilder
 from msdgs_export.plans.base import Plan, PlanSpec
 from msdgs_export.plans.scene_graph import activated, finished
+from msdgs_export.target import squared
 from msdgs_export.trajectories.levels import LEADING, OWN, RANKS, Errors, Levels, sizes
 from msdgs_export.trajectories.poses import MEANS, POSE, QUATS, SCALES
 from msdgs_export.trajectories.sampling import Ids, Trajectories
@@ -46,7 +47,7 @@ def compact(baked: Baked, spec: PlanSpec, trajectories: Trajectories) -> onnx.Mo
     """The scene with a predicted motion error of `spec.count` dB, or the smallest there is."""
     levels, rows = trajectories.once(Levels), trajectories.rows
     assert spec.count is not None
-    choice = chosen(levels, rows, 10 ** (-spec.count / 10))
+    choice = chosen(levels, rows, squared(spec.count))
     graph, time_range = GraphBuilder(), baked.scene.metadata.time_range
     ranks = [int(rank) for rank in np.unique(choice.ranks) if rank > 0]
     own = _own_poses(levels, rows, choice)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cholesky, eigh, solve_triangular
 
+from msdgs_export.target import squared
 from msdgs_export.trajectories.poses import MEANS, POSE, QUATS, SCALES
 from msdgs_export.trajectories.sampling import Ids, Samples, Trajectories
 from msdgs_export.trajectories.splines import along_time, design, fitting, samples_for
@@ -29,7 +30,7 @@ OWN = tuple((count, bits) for bits in (8, 16) for count in (7, 11, 19, 35, 67, 1
 KNOTS = (35, 67, 131)
 """Numbers of control points of shared functions."""
 
-ENOUGH = 10 ** (-56 / 10)
+ENOUGH = squared(56)
 """Functions have the fewest control points with which they alone would add this squared error to a frame."""
 
 SAMPLED = 2048

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from msdgs_export.bake import Baked
 from msdgs_export.measure.views import cameras_of_file
 from msdgs_export.progress import Track, no_progress
+from msdgs_export.target import squared
 from msdgs_export.trajectories.poses import POSE, QUATS, ExactPoses
 from msdgs_export.trajectories.sensitivity import PASSES, sensitivities, square_roots
 from msdgs_serve.scene.camera import Camera
@@ -24,7 +25,7 @@ from msdgs_serve.scene.camera import Camera
 COARSE, FINEST = 64, 2048
 """Numbers of intervals between samples: of all Gaussians, and of the fastest."""
 
-RESOLVED = 10 ** (-60 / 10)
+RESOLVED = squared(60)
 """Default of the squared error of a frame that cubics of all Gaussians together, each at its worst time, should not
 exceed."""
 
