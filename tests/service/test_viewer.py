@@ -17,7 +17,7 @@ from msdgs_serve.api.routes.viewer import FILES, FOLDER
 from msdgs_serve.imaging import ImageFormat
 from tests.service.conftest import MILLISECONDS, open_page
 from tests.support.images import decode
-from tests.support.processes import bodies, forget, image, wait_for, wait_until_still
+from tests.support.processes import HOLD_FRAMES, bodies, forget, image, wait_for, wait_until_still
 from tests.support.scene_files import metadata, write_scene
 from tests.support.service import serving
 
@@ -152,29 +152,6 @@ def test_two_fingers_zoom(browser: Browser, client: httpx.Client):
 
 def began_again(asked: list[dict[str, Any]]) -> bool:
     return any(later["t"] < earlier["t"] for earlier, later in itertools.pairwise(asked))
-
-
-HOLD_FRAMES = """() => {
-    const send = window.fetch;
-    const released = new Promise((resolve) => { window.release = resolve; });
-    window.waiting = 0;
-    window.mostWaiting = 0;
-    window.fetch = async (address, options) => {
-        if (address !== "render") return send(address, options);
-        window.waiting += 1;
-        window.mostWaiting = Math.max(window.mostWaiting, window.waiting);
-        const aborted = new Promise((_, fail) => {
-            options.signal.addEventListener("abort", () => fail(options.signal.reason));
-        });
-        try {
-            await Promise.race([released, aborted]);
-            return await send(address, options);
-        } finally {
-            window.waiting -= 1;
-        }
-    };
-}"""
-"""Holds the requests for frames until `release()`; counts those that have no response yet, and the most at one time."""
 
 
 def test_it_plays_with_one_request_ahead(opened: Page):

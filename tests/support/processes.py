@@ -21,6 +21,28 @@ from tests.support.images import decode
 
 ROOT = Path(__file__).parents[2]
 
+HOLD_FRAMES = """() => {
+    const send = window.fetch;
+    const released = new Promise((resolve) => { window.release = resolve; });
+    window.waiting = 0;
+    window.mostWaiting = 0;
+    window.fetch = async (address, options) => {
+        if (address !== "render") return send(address, options);
+        window.waiting += 1;
+        window.mostWaiting = Math.max(window.mostWaiting, window.waiting);
+        const aborted = new Promise((_, fail) => {
+            options.signal.addEventListener("abort", () => fail(options.signal.reason));
+        });
+        try {
+            await Promise.race([released, aborted]);
+            return await send(address, options);
+        } finally {
+            window.waiting -= 1;
+        }
+    };
+}"""
+"""Holds the requests for frames until `release()`; counts those that have no response yet, and the most at one time."""
+
 
 def run_python(code: str, *arguments: object, **environment: str) -> str:
     """Run code in another process and return its output; `environment` is added to the variables of this process."""
