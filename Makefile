@@ -90,7 +90,7 @@ $(FULL)/.installed-train: pyproject.toml constraints.txt
 	@touch $@
 
 $(FULL)/.installed-dev: $(FULL)/.installed-train
-	$(PINS) $(FULL)/bin/python $(INSTALL) --editable '.[train,export,dev]'
+	$(PINS) $(FULL)/bin/python $(INSTALL) --editable '.[train,export,capture,dev]'
 	@touch $@
 
 # Programs that read the files written here or write files that are read here, run by the Node that pyright brings.

@@ -1,0 +1,1 @@
+"""From videos to a dataset with camera poses and times: a COLMAP folder and `times.json`."""
