@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-SAMPLES = 2_000
-"""Pixels, evenly spread over the image, that a fundamental matrix is fitted to."""
-TRIALS, CONFIDENCE = 2_000, 0.9999
-CLOSE = 0.7
+SAMPLES = 1_500
+"""Pixels, evenly spread over the image, that an essential matrix is fitted to."""
+TRIALS, CONFIDENCE = 1_000, 0.9999
+CLOSE = 0.15
 """Pixels from its epipolar line within which a point is taken to be at rest."""
 MIN_POINTS = 50
+USUAL_FOCAL = 1.2
+"""Focal length in long sides of the image, COLMAP's first guess."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,9 @@ class Lens:
     @staticmethod
     def unknown(shape: tuple[int, ...]) -> "Lens":
         """A lens without distortion."""
-        return Lens.of(np.array([max(shape), shape[1] / 2, shape[0] / 2, 0.0]), (shape[1], shape[0]), shape)
+        return Lens.of(
+            np.array([USUAL_FOCAL * max(shape), shape[1] / 2, shape[0] / 2, 0.0]), (shape[1], shape[0]), shape
+        )
 
     def undistorted(self, flow: np.ndarray | None = None) -> np.ndarray:
         """[H, W, 2] pixels moved by the flow, [H, W, 2], if any, in the pinhole image."""
@@ -40,9 +44,7 @@ class Lens:
         pixels = pixels if flow is None else pixels + flow
         if self.k1 == 0:
             return pixels
-        moved = cv2.undistortPoints(
-            pixels.reshape(-1, 1, 2), self.matrix, np.array([self.k1, 0, 0, 0]), P=self.matrix
-        )
+        moved = cv2.undistortPoints(pixels.reshape(-1, 1, 2), self.matrix, np.array([self.k1, 0, 0, 0]), P=self.matrix)
         return moved.reshape(height, width, 2)
 
 
@@ -55,14 +57,18 @@ def fundamental_of_poses(one: np.ndarray, other: np.ndarray, lens: Lens) -> np.n
     return inverse.T @ cross @ relative[:3, :3] @ inverse
 
 
-def robust_fundamental(starts: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
-    """[3, 3] F that most of the [N, 2] points agree with, if there is one."""
+def robust_fundamental(starts: np.ndarray, ends: np.ndarray, lens: Lens) -> np.ndarray | None:
+    """[3, 3] F of the camera motion that most of the [N, 2] points agree with, if there is one."""
     if len(starts) < MIN_POINTS:
         return None
     chosen = np.linspace(0, len(starts) - 1, min(SAMPLES, len(starts))).astype(int)
-    options = cv2.USAC_MAGSAC
-    found, _ = cv2.findFundamentalMat(starts[chosen], ends[chosen], options, CLOSE, CONFIDENCE, TRIALS)
-    return found if found is not None and found.shape == (3, 3) else None
+    found, _ = cv2.findEssentialMat(
+        starts[chosen], ends[chosen], lens.matrix, cv2.USAC_MAGSAC, CONFIDENCE, CLOSE, TRIALS
+    )
+    if found is None or found.shape != (3, 3):
+        return None
+    inverse = np.linalg.inv(lens.matrix)
+    return inverse.T @ found @ inverse
 
 
 def line_distances(fundamental: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:

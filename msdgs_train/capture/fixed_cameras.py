@@ -6,6 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from msdgs_train.capture.image_files import read_color, read_gray
+
 CORNERS, CORNER_QUALITY, CORNER_DISTANCE = 300, 0.02, 7
 STILL = 0.002
 """Part of the width by which a corner of the background may move: one pixel of 500."""
@@ -21,17 +23,17 @@ def is_fixed(files: Sequence[Path]) -> bool:
     """Whether most corners of the first image stay where they are in the others, which are in the order of time."""
     if len(files) < 2:
         return False
-    first = _gray(files[0])
+    first = read_gray(files[0])
     corners = cv2.goodFeaturesToTrack(first, CORNERS, CORNER_QUALITY, CORNER_DISTANCE)
     if corners is None:
         return False
-    still = [_still_part(first, _gray(file), corners) for file in spread(files[1:], COMPARED)]
+    still = [_still_part(first, read_gray(file), corners) for file in spread(files[1:], COMPARED)]
     return float(np.median(still)) > MOST
 
 
 def background(files: Sequence[Path]) -> np.ndarray:
     """[H, W, 3] uint8, BGR: the median of images of a fixed camera, without what passes through them."""
-    images = np.stack([read_image(file) for file in spread(files, BACKGROUND)])
+    images = np.stack([read_color(file) for file in spread(files, BACKGROUND)])
     return np.median(images, axis=0).astype(np.uint8)
 
 
@@ -39,18 +41,6 @@ def spread(files: Sequence[Path], count: int) -> list[Path]:
     """At most `count` of the files, at even distances, with the first and the last."""
     chosen = np.linspace(0, len(files) - 1, min(count, len(files))).round().astype(int)
     return [files[index] for index in chosen]
-
-
-def read_image(file: Path) -> np.ndarray:
-    """[H, W, 3] uint8, BGR."""
-    image = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR)
-    if image is None:
-        raise OSError(f"{file} is not an image")
-    return image
-
-
-def _gray(file: Path) -> np.ndarray:
-    return cv2.cvtColor(read_image(file), cv2.COLOR_BGR2GRAY)
 
 
 def _still_part(first: np.ndarray, other: np.ndarray, corners: np.ndarray) -> float:

@@ -19,16 +19,19 @@ from msdgs_train.capture.poses import Poses
 
 WORKING_SIZE = 384
 """Long side in pixels at which flow is computed; distances below are in these pixels."""
-GAPS = (1, 2, 4)
+GAPS = (1, 2)
 """Frames between the two of a pair, before and after."""
 ROUND_TRIP = 1.5
 """Flow there and back must return to within this; where it doesn't, as behind an edge, a pair says nothing."""
-NOISE = 0.25
+NOISE = 0.2
 """Least noise of the distances to epipolar lines."""
-SURE, LIKELY = 5.0, 2.5
+AT_REST = 0.2
+"""Distance to an epipolar line that it explains."""
+SURE, LIKELY = 4.0, 2.0
 """Distance in units of the noise at which a pixel surely moves, and at which it does beside one that surely does."""
 FIT_SHARE = 0.9
-"""Poses' epipolar geometry is taken if it explains this part of the pixels that one fitted to the flow explains."""
+"""Poses' epipolar geometry is taken if it explains this part of the pixels that one fitted to the flow explains: the
+first poses may follow what moves."""
 CHANGED, NOISES = 14.0, 4.0
 """Least change of a color, in 8 bits and in units of the noise, from the background of a fixed camera."""
 SMALLEST = 0.001
@@ -114,32 +117,25 @@ def _reduced(gray: np.ndarray) -> np.ndarray:
 def _pair(one: _Shot, other: _Shot, lens: Lens | None, flow: cv2.DISOpticalFlow) -> tuple[np.ndarray, np.ndarray]:
     """[H, W] distances of both frames' pixels to epipolar lines in units of the noise; NaN where the flow is unsure."""
     there, back = flow.calc(one.gray, other.gray, None), flow.calc(other.gray, one.gray, None)
-    known = lens is not None and one.camera_to_world is not None and other.camera_to_world is not None
-    lens = lens or Lens.unknown(one.gray.shape)
-    starts, ends = lens.undistorted(), lens.undistorted(there)
     sure = _returns(there, back)
-    geometry = robust_fundamental(starts[sure], ends[sure])
-    if known:
-        of_poses = fundamental_of_poses(one.camera_to_world, other.camera_to_world, lens)
-        geometry = _better(of_poses, geometry, starts[sure], ends[sure])
-    if geometry is None:
+    known = one.camera_to_world is not None and other.camera_to_world is not None
+    best, explained = None, 0.0
+    for each in filter(None, (lens, Lens.unknown(one.gray.shape))):
+        starts, ends, returns = each.undistorted(), each.undistorted(there), each.undistorted(back)
+        geometries = [(robust_fundamental(starts[sure], ends[sure], each), FIT_SHARE)]
+        if known and each is lens:
+            geometries.append((fundamental_of_poses(one.camera_to_world, other.camera_to_world, each), 1.0))
+        for geometry, weight in geometries:
+            if geometry is None:
+                continue
+            forward = line_distances(geometry, starts, ends)
+            share = weight * float(np.mean(forward[sure] < AT_REST))
+            if share > explained:
+                best, explained = (forward, line_distances(geometry.T, starts, returns)), share
+    if best is None:
         return (np.full(one.gray.shape, np.nan),) * 2
-    back_ends = lens.undistorted(back)
-    distances = line_distances(geometry, starts, ends), line_distances(geometry.T, starts, back_ends)
-    noise = max(1.48 * float(np.median(distances[0][sure])), NOISE)
-    return (
-        np.where(sure, distances[0] / noise, np.nan),
-        np.where(_returns(back, there), distances[1] / noise, np.nan),
-    )
-
-
-def _better(
-    of_poses: np.ndarray, fitted: np.ndarray | None, starts: np.ndarray, ends: np.ndarray
-) -> np.ndarray:
-    if fitted is None:
-        return of_poses
-    explained = [np.mean(line_distances(each, starts, ends) < 4 * NOISE) for each in (of_poses, fitted)]
-    return of_poses if explained[0] >= FIT_SHARE * explained[1] else fitted
+    noise = max(1.48 * float(np.median(best[0][sure])), NOISE)
+    return np.where(sure, best[0] / noise, np.nan), np.where(_returns(back, there), best[1] / noise, np.nan)
 
 
 def _returns(there: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -169,7 +165,9 @@ def cleaned(score: np.ndarray, sure: float, likely: float) -> np.ndarray:
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, _disc(5))
     mask = cv2.morphologyEx(mask, cv2.MORPH_OPEN, _disc(3))
     smallest = SMALLEST * mask.size
-    kept = _components(mask, lambda labels, area: (area >= smallest) & (_most_per_label(smooth, labels, len(area)) > sure))
+    kept = _components(
+        mask, lambda labels, area: (area >= smallest) & (_most_per_label(smooth, labels, len(area)) > sure)
+    )
     solid = 1 - _components(1 - kept, lambda labels, area: area >= smallest)
     return 255 * cv2.dilate(solid, _disc(5))
 

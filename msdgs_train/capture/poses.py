@@ -8,13 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from msdgs_serve.writing import replacing
 from msdgs_train.capture.fixed_cameras import background, is_fixed
-from msdgs_train.capture.image_files import read_gray, write_image
 from msdgs_train.capture.frame_set import FrameSet
+from msdgs_train.capture.image_files import read_gray, write_image
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, run_sfm
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 from msdgs_train.capture.views import View, matched_pairs
@@ -67,10 +63,10 @@ def find_poses(
     workspace = workspace.absolute()
     workspace.mkdir(parents=True, exist_ok=True)
     names = [tuple(frame.name for frame in frames.frames if frame.camera == i) for i in range(len(frames.cameras))]
-    fixed = tuple(_background(images, own, workspace, camera, len(names)) for camera, own in enumerate(names))
-    views = [
-        View(frame.name, frame.camera, frame.time) for frame in frames.frames if not fixed[frame.camera]
-    ] + [View(f"{camera}.png", camera, 0.0, True) for camera, stands in enumerate(fixed) if stands]
+    fixed = tuple(_background(images, own, workspace, camera) for camera, own in enumerate(names))
+    views = [View(frame.name, frame.camera, frame.time) for frame in frames.frames if not fixed[frame.camera]] + [
+        View(f"{camera}.png", camera, 0.0, True) for camera, stands in enumerate(fixed) if stands
+    ]
     cameras = tuple(
         CameraViews(str(workspace / BACKGROUNDS), (f"{camera}.png",), own)
         if fixed[camera]
@@ -79,34 +75,25 @@ def find_poses(
         if own
     )
     feature_masks = None if masks is None else _feature_masks(masks, workspace / FEATURE_MASKS, views)
-    job = PosesJob(
-        str(workspace), cameras, tuple(matched_pairs(views)), feature_masks, seed, threads or ALL_PROCESSORS
-    )
+    job = PosesJob(str(workspace), cameras, tuple(matched_pairs(views)), feature_masks, seed, threads or ALL_PROCESSORS)
     run_sfm(job, images, progress)
     return Poses.load(workspace, frames)
 
 
-def _background(images: Path, names: tuple[str, ...], workspace: Path, camera: int, cameras: int) -> bool:
-    """Write the background of a camera among several, if it is fixed, and return whether it is."""
+def _background(images: Path, names: tuple[str, ...], workspace: Path, camera: int) -> bool:
+    """Write the background of a camera, if it is fixed, and return whether it is."""
     files = [images / name for name in names]
     file = workspace / BACKGROUNDS / f"{camera}.png"
     file.unlink(missing_ok=True)
     if not is_fixed(files):
         return False
-    file.parent.mkdir(exist_ok=True)
-    with replacing(file) as temporary:
-        cv2.imwrite(str(temporary), background(files))
+    write_image(file, background(files))
     return True
 
 
 def _feature_masks(masks: Path, out: Path, views: list[View]) -> str:
     """Write the masks as COLMAP takes them, black where no features are taken, and return their folder."""
     for view in views:
-        if view.is_background:
-            continue
-        moving = cv2.imdecode(np.fromfile(masks / view.name, np.uint8), cv2.IMREAD_GRAYSCALE)
-        file = out / f"{view.name}.png"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as temporary:
-            cv2.imwrite(str(temporary), 255 - moving)
+        if not view.is_background:
+            write_image(out / f"{view.name}.png", 255 - read_gray(masks / view.name))
     return str(out)

@@ -32,6 +32,9 @@ ENOUGH = 0.95
 BATCH = 16
 """Images, or hundreds of pairs, between two reports of progress."""
 WARNINGS_ONLY = 2
+TOLERANCE = 1 / 700
+"""Pixels of error, per pixel of the long side, that a match and a point may have; at least one. COLMAP's are four pixels,
+which in a small image is the motion of an object between two frames."""
 
 
 def main() -> None:
@@ -94,6 +97,7 @@ def match(job: PosesJob, database: Path) -> None:
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = job.seed
+    geometry.ransac.max_error = _tolerance(database)
     chosen = Path(job.workspace) / "pairs.txt"
     done = 0
     for pairs in _batches(job.pairs, 100):
@@ -129,6 +133,10 @@ def _incremental(job: PosesJob, database: Path, scratch: Path, total: int) -> li
     options.max_extra_param = MAX_EXTRA_PARAMETER
     options.mapper.random_seed = options.triangulation.random_seed = job.seed
     options.mapper.num_threads = job.threads
+    tolerance = _tolerance(database)
+    options.mapper.init_max_error = options.mapper.filter_max_reproj_error = tolerance
+    options.mapper.abs_pose_max_error = 3 * tolerance
+    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = tolerance
     added = 0
 
     def count() -> None:
@@ -192,7 +200,7 @@ def summary(model: pycolmap.Reconstruction, method: str, others: list[int], rota
     return Summary(
         names=np.array([image.name for image in images], dtype=str),
         camera_to_world=poses,
-        intrinsics=np.array([camera.params for camera in cameras], float).reshape(-1, 4),
+        intrinsics=np.array([camera.params for camera in cameras], float).reshape(len(images), -1),
         points=np.array([point.xyz for point in points]).reshape(-1, 3),
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         observations=np.array(seen, np.int64).reshape(-1, 2),
@@ -229,6 +237,11 @@ def _rotation_only(database: Path) -> float:
     known = pycolmap.TwoViewGeometryConfiguration
     verified = [kind for kind in kinds if kind not in (known.UNDEFINED, known.DEGENERATE)]
     return sum(kind == known.PANORAMIC for kind in verified) / max(len(verified), 1)
+
+
+def _tolerance(database: Path) -> float:
+    with pycolmap.Database.open(database) as opened:
+        return max(1.0, TOLERANCE * max(max(camera.width, camera.height) for camera in opened.read_all_cameras()))
 
 
 def _camera_of(database: Path, name: str) -> int:

@@ -65,4 +65,6 @@ class Summary:
         for rows in np.split(order, starts[1:]):
             chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), BUNDLE)).astype(int)]
             largest[rows] = np.degrees(np.arccos(np.clip(rays[rows] @ rays[chosen].T, -1, 1))).max(axis=1)
-        return np.array([np.median(largest[image == i]) if (image == i).any() else np.nan for i in range(len(self.names))])
+        return np.array(
+            [np.median(largest[image == i]) if (image == i).any() else np.nan for i in range(len(self.names))]
+        )

@@ -20,7 +20,7 @@ from msdgs_train.datasets.synthetic.motion import GROUND_THICKNESS, GROUND_Z, Mo
 from msdgs_train.datasets.synthetic.rendering import NO_OBJECT, first_hit, render
 from msdgs_train.datasets.synthetic.shapes import FRAME
 
-ROOM = np.array([[-3.0, -3.2, GROUND_Z - GROUND_THICKNESS], [3.0, 3.2, 2.6]])
+ROOM = np.array([[-2.6, -3.2, GROUND_Z - GROUND_THICKNESS], [2.6, 2.3, 2.6]])
 """Opposite corners of the room; all cameras are in it."""
 FIELD_OF_VIEW = 0.9  # radians, across the width
 TARGET = np.array([0.0, 0.3, 0.0])
@@ -139,7 +139,7 @@ class _Textures:
         self.scale = TEXELS * 0.5 * width / math.tan(0.5 * FIELD_OF_VIEW)
         sizes = ROOM[1] - ROOM[0]
         self.faces = [
-            [_collage(*np.delete(sizes, axis) * self.scale, random, contrast=0.7) for _ in range(2)]
+            [_collage(*np.delete(sizes, axis) * self.scale, random, contrast=0.9) for _ in range(2)]
             for axis in range(3)
         ]
         self.poster = _collage(*np.array(POSTER_SIZE) * self.scale, random, contrast=0.4)
