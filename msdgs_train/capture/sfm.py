@@ -33,8 +33,8 @@ BATCH = 16
 """Images, or hundreds of pairs, between two reports of progress."""
 WARNINGS_ONLY = 2
 TOLERANCE = 1 / 700
-"""Pixels of error, per pixel of the long side, that a match and a point may have; at least one. COLMAP's are four pixels,
-which in a small image is the motion of an object between two frames."""
+"""Pixels of error, per pixel of the long side, that a match and a point may have; at least one. COLMAP's are four
+pixels, which in a small image is the motion of an object between two frames."""
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Structure from motion in a process of its own, which can be stopped at any time and whose crash is an error here.
 
-OpenCV and pycolmap bring libraries of the same names, so that one process that uses both may crash: pycolmap is imported
-in that process only.
+OpenCV and pycolmap bring libraries of the same names, so that one process that uses both may crash: pycolmap is
+imported in that process only.
 """
 
 import json

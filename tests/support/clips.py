@@ -201,7 +201,7 @@ def _poster(origin: np.ndarray, rays: np.ndarray, t: float, textures: _Textures)
     """Where the rays hit the poster, [H, W] bool, and its colors there."""
     turn = 0.25 * math.sin(2.2 * math.pi * t)
     right, up = np.array([math.cos(turn), math.sin(turn), 0.0]), UP
-    center = np.array([0.4 * math.sin(math.pi * (t - 0.5)), 1.45, 0.55 + 0.2 * math.sin(1.7 * math.pi * t)])
+    center = np.array([0.35 * math.sin(4 * math.pi * t), 1.45, 0.55 + 0.2 * math.sin(5 * math.pi * t)])
     normal = np.cross(right, up)
     reach = ((center - origin) @ normal) / (rays @ normal)
     hits = origin + reach[..., None] * rays - center
