@@ -1,6 +1,6 @@
 """Draw the pictures of docs/your_scene.md: three ways to move a camera, from above, and what it sees.
 
-    python -m benchmarks.training.how_to_film docs/images
+python -m benchmarks.training.how_to_film docs/images
 """
 
 import argparse
@@ -13,7 +13,7 @@ from matplotlib.patches import Circle, Polygon
 
 from msdgs_serve.writing import replacing
 from tests.support.camera_moves import TARGET, arc, pan, tripod
-from tests.support.clips import FIELD_OF_VIEW, Textures, camera_of, shot
+from tests.support.clips import FIELD_OF_VIEW, views_of_poses
 
 MOVES = {
     "arc": ("walk around it", "#2f855a", arc(60, 9)),
@@ -32,14 +32,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="folder of the pictures")
     out = parser.parse_args().out
-    textures = Textures(WIDTH, 0)
     for name, (title, color, poses) in MOVES.items():
         figure = Figure(figsize=(9.6, 2.3), dpi=DPI, layout="constrained")
         above, *frames = figure.subplots(1, 4, width_ratios=(1, 1.1, 1.1, 1.1))
         draw_above(above, title, color, poses)
+        views = views_of_poses(poses, WIDTH)
         for place, index in zip(frames, SEEN, strict=True):
-            t = index / (len(poses) - 1)
-            place.imshow(shot(camera_of(poses[index], WIDTH), t, textures, poster=False)[0])
+            place.imshow(views[index][0])
             place.set(xticks=[], yticks=[])
             place.set_title(f"frame {index + 1} of {len(poses)}", fontsize=9)
         with replacing(out / f"film_{name}.webp") as temporary:
@@ -58,7 +57,7 @@ def draw_above(place: Axes, title: str, color: str, poses: list[np.ndarray]) -> 
     path = np.array([pose[:2, 3] for pose in poses])
     place.plot(*path.T, color=color, linewidth=1)
     place.set(xlim=(-1.9, 1.9), ylim=(-2.4, 1.1), aspect="equal")
-    place.set_title(title, fontsize=10, color=color, weight="bold")
+    place.set_title(title, fontsize=10, color=color, weight="bold", y=0.9)
     place.axis("off")
 
 

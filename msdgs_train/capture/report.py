@@ -17,6 +17,7 @@ from msdgs_train.capture.figures import draw_parallax, draw_path
 from msdgs_train.capture.fixed_cameras import spread
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.image_files import read_color, read_gray
+from msdgs_train.capture.masked_poses import MaskedPoses
 from msdgs_train.capture.measures import Measures
 from msdgs_train.capture.sparse_model import Summary
 from msdgs_train.capture.steps import Progress
@@ -39,12 +40,19 @@ class Report:
     frames: FrameSet
     measures: Measures
     verdict: Verdict
-    moving: Mapping[str, float]
-    """Share of each frame that moves, where masks were made."""
     images: Path
-    masks: Path
-    model: Summary | None
-    """None before poses were sought; it may have no frames."""
+    found: MaskedPoses | None
+    """None before poses were sought; they may be of no frame."""
+
+    @property
+    def moving(self) -> Mapping[str, float]:
+        """Share of each frame that moves, if masks were made."""
+        return self.found.moving if self.found else {}
+
+    @property
+    def model(self) -> Summary | None:
+        """The poses, if there are any."""
+        return self.found.poses.summary if self.found and self.found.poses.registered else None
 
 
 def write_report(report: Report, folder: Path, progress: Progress) -> None:
@@ -52,7 +60,7 @@ def write_report(report: Report, folder: Path, progress: Progress) -> None:
     parallax = _parallax(report)
     write_text(folder / "capture.json", json.dumps(_plain(report, parallax), indent=1) + "\n")
     drawings = {"path": "", "parallax": ""}
-    if report.model is not None and len(report.model.names):
+    if report.model is not None:
         cameras = {frame.name: frame.camera for frame in report.frames.frames}
         drawings["path"] = draw_path(report.model, np.array([cameras[str(name)] for name in report.model.names]))
         drawings["parallax"] = draw_parallax(report.frames, parallax)
@@ -127,7 +135,9 @@ def _sheet(report: Report, progress: Progress) -> Iterator[str]:
     names: Sequence[Path] = spread([Path(frame.name) for frame in report.frames.frames], SHOWN)
     times = {frame.name: frame.time for frame in report.frames.frames}
     for done, name in enumerate(map(Path.as_posix, names), start=1):
-        coded = base64.b64encode(_thumbnail(report.images / name, report.masks / name)).decode()
+        coded = base64.b64encode(
+            _thumbnail(report.images / name, report.found.masks / name if report.found else None)
+        ).decode()
         caption = f"{times[name]:.2f} s" + (f", {report.moving[name]:.0%} moves" if name in report.moving else "")
         yield (
             f'<figure><img alt="{escape(name)}" src="data:image/jpeg;base64,{coded}">'
@@ -136,10 +146,10 @@ def _sheet(report: Report, progress: Progress) -> Iterator[str]:
         progress("pictures", done, len(names))
 
 
-def _thumbnail(image: Path, mask: Path) -> bytes:
+def _thumbnail(image: Path, mask: Path | None) -> bytes:
     """A frame as JPEG, with what moves in red, where it has a mask."""
     picture = _reduced(read_color(image))
-    if mask.is_file():
+    if mask is not None:
         moves = _reduced(read_gray(mask))[..., None] / 255
         picture = np.round(picture * (1 - 0.55 * moves) + 0.55 * moves * MOVING).astype(np.uint8)
     return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

@@ -14,7 +14,7 @@ from msdgs_train.cli.console import console, progress_bar
 from msdgs_train.settings import optional
 
 RECORDINGS_AND_DATA = tyro.conf.arg(metavar="IN... DATA", help_behavior_hint="(one or more, then one)")
-Step = Literal["frames", "poses", "masks", "poses-again", "dataset", "report"]
+Step = Literal["frames", "poses", "masks", "dataset", "report"]
 
 
 @dataclass(frozen=True)
@@ -25,8 +25,8 @@ class Capture:
     camera each. DATA is the folder to create: a COLMAP dataset with times.json, and capture.html, which shows what was
     found and says whether it suffices for a scene, or what to record differently. It shows pictures of the recording.
 
-    Steps are frames, poses, masks, poses-again (without what moves), dataset, report. Ctrl-C loses the one under way;
-    the same command continues, and repeats what other options change.
+    Steps are frames, poses, masks of what moves, then poses and masks without it as long as that helps, dataset and
+    report. Ctrl-C loses the one under way; the same command continues, and repeats what other options change.
 
     One moving camera:  msdgs-train capture clip.mp4 data/clip
 
