@@ -41,7 +41,7 @@ class VideoSource:
             width = first.width * float(stream.sample_aspect_ratio or 1)
             shown = (first.height, width) if self._turn.transposed else (width, first.height)
         self.width, self.height = fitted(*shown, size)
-        self.count, self.duration, self.is_timed = self._packets()
+        self.count, self.start, self.duration, self.is_timed = self._packets()
         self._broken = 0
 
     def pictures(self) -> Iterator[Picture]:
@@ -79,8 +79,8 @@ class VideoSource:
             notes.append(f"{self.file.name} is HDR ({kind}): the brightest parts are compressed into sRGB")
         return notes
 
-    def _packets(self) -> tuple[int, float, bool]:
-        """Number of frames, seconds between the first and last, and whether they have times."""
+    def _packets(self) -> tuple[int, float, float, bool]:
+        """Number of frames, time of the first in the file in seconds, duration, and whether frames have times."""
         from av.error import FFmpegError
 
         with opened(self.file) as container:
@@ -95,7 +95,9 @@ class VideoSource:
             count = max(count, stream.frames if not times else 0)
             is_decoding_order = container.format.name == "avi" and stream.codec_context.has_b_frames
         is_timed = len(set(times)) > MOSTLY * count and not is_decoding_order
-        return count, (max(times) - min(times) if is_timed else (count - 1) * self.period), is_timed
+        if not is_timed:
+            return count, 0.0, (count - 1) * self.period, False
+        return count, min(times), max(times) - min(times), True
 
     def _decoded(self, container: Any, stream: Any) -> Iterator[Any]:
         """Yield the frames, and count what can't be decoded."""

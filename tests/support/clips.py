@@ -5,6 +5,7 @@ poster are planes with images on them, so that each pixel's surface is known exa
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -63,9 +64,29 @@ def moving_camera_clip(
     elevations = 17 + 7 * np.sin(5 * parts)
     distances = 2.35 + 0.2 * np.sin(4 * parts)
     poses = [_pose(*view) for view in zip(distances, azimuths, elevations, strict=True)]
-    textures = _Textures(width, seed)
-    views = [_shot(_camera(pose, width), t, textures, poster) for pose, t in zip(poses, parts, strict=True)]
-    return _written(file, poses, width, views, rate)
+    return clip_of_poses(file, poses, width=width, rate=rate, poster=poster, seed=seed)
+
+
+def clip_of_poses(
+    file: Path,
+    poses: Sequence[np.ndarray],
+    *,
+    width: int = 256,
+    rate: float = 12.0,
+    poster: bool = False,
+    seed: int = 0,
+) -> Clip:
+    """Write a video of a camera that has these poses, camera to world, one after the other."""
+    return _written(file, poses, width, views_of_poses(poses, width, poster=poster, seed=seed), rate)
+
+
+def views_of_poses(
+    poses: Sequence[np.ndarray], width: int, *, poster: bool = False, seed: int = 0
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """What a camera of these poses sees while time runs from 0 to 1: images, [H, W, 3] uint8, and where they move,
+    [H, W] bool."""
+    textures, times = _Textures(width, seed), np.linspace(0, 1, len(poses))
+    return [_shot(_camera(pose, width), t, textures, poster) for pose, t in zip(poses, times, strict=True)]
 
 
 def fixed_camera_clips(
@@ -108,7 +129,7 @@ def write_video(file: Path, images: list[np.ndarray], rate: float, sound: np.nda
 
 def _written(
     file: Path,
-    poses: list[np.ndarray],
+    poses: Sequence[np.ndarray],
     width: int,
     views: list[tuple[np.ndarray, np.ndarray]],
     rate: float,
