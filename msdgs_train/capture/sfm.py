@@ -26,8 +26,8 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 MAX_EXTRA_PARAMETER = 0.5
 """Of the distortion; models with more are wrong ones of few images."""
 BACKGROUND_PEAK = 0.002
-"""Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is but
-one view of each camera."""
+"""Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is
+but one view of each camera."""
 MIN_MODEL = 3
 """Images of the smallest model."""
 ENOUGH = 0.95
@@ -201,7 +201,7 @@ def summary(model: pycolmap.Reconstruction, method: str, others: list[int], rota
     for index, image in enumerate(images):
         poses[index, :3] = image.cam_from_world().inverse().matrix()
         seen += [(index, rows[point.point3D_id]) for point in image.get_observation_points2D()]
-    cameras = [image.camera for image in images]
+    cameras = [model.camera(image.camera_id) for image in images]
     points = [model.point3D(point_id) for point_id in ids]
     return Summary(
         names=np.array([image.name for image in images], dtype=str),
@@ -230,7 +230,7 @@ def write_undistorted(job: UndistortedJob) -> None:
                 point.xy = pinhole.img_from_cam(np.append(local, 1.0))
     for key, pinhole in pinholes.items():
         camera = model.camera(key)
-        camera.model, camera.params = pinhole.model, pinhole.params
+        camera.model, camera.params = pinhole.model, list(pinhole.params)
         camera.width, camera.height = pinhole.width, pinhole.height
     Path(job.out).mkdir(parents=True, exist_ok=True)
     model.write(job.out)
