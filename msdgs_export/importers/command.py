@@ -1,4 +1,4 @@
-"""The inputs of `msdgs-export` other than a model.pt."""
+"""The inputs of `msdgs-export`."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +17,6 @@ from msdgs_export.importers.sequence import posed, read_sequence, sequence_scene
 from msdgs_export.importers.splats.formats import READERS, read_splats
 from msdgs_export.importers.splats.sog import META
 from msdgs_export.progress import tracked
-from msdgs_export.target import MIN_PSNR
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.writing import scratch_folder
 
@@ -30,7 +29,7 @@ def trained_model(path: Path, file_format: str, console: Console) -> Iterator[tu
     """The model.pt of an input of one of `TRAINED`, the given one or a temporary one that is made from another
     trainer's run; and entries for `left_out`. Raises `ImportFailed`."""
     if file_format == "model":
-        yield path / "model.pt" if path.is_dir() else path, []
+        yield (path / "model.pt" if path.is_dir() else path), []
     else:
         with scratch_folder() as folder:
             model = folder / "model.pt"
@@ -43,8 +42,8 @@ class Import(NamedTuple):
     path: Path
     format: str
     output: Path
-    min_psnr: float | None = MIN_PSNR  # dB, of frames of packed arrays; None: arrays stay float32
-    up: np.ndarray | None = None  # [3] unit; None: what the file says
+    min_psnr: float | None  # dB, of frames of packed arrays; None: arrays stay float32
+    up: np.ndarray | None  # [3] unit; None: what the file says
 
 
 def import_scene(job: Import, console: Console) -> None:
