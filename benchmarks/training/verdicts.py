@@ -76,7 +76,7 @@ def captured(case: Case, width: int, threads: int) -> dict[str, object]:
         clip = clip_of_poses(folder / "clip.mp4", case.poses, width=width, poster=case.poster)
         data = folder / "data"
         watch = lambda name, is_kept: nullcontext(lambda stage, done, total: None)  # noqa: E731
-        verdict = CaptureJob([clip.file], data, CaptureOptions(), threads=threads, watch=watch).run()
+        verdict = CaptureJob([clip.file], data, CaptureOptions(), threads=threads, watch=watch).run().verdict
         report = json.loads((data / "capture.json").read_text(encoding="utf-8"))
         row = {"clip": case.name, "frames": len(case.poses)} | {name: round(report[name], 3) for name in FIGURES}
         return row | _errors(data, clip.camera_to_world) | {"verdict": verdict.text.replace("\n", " / ")}

@@ -70,6 +70,7 @@ def write_report(report: Report, folder: Path, progress: Progress) -> None:
         figures="".join(_row(name, value) for name, value in figures(report.measures)),
         path=_section("Cameras and points", drawings["path"]),
         parallax=_section("Parallax a frame", drawings["parallax"]),
+        notes="".join(f"<p>{escape(note)}</p>" for note in report.frames.notes),
         sheet="".join(_sheet(report, progress)),
     )
     write_text(folder / "capture.html", page)
@@ -115,7 +116,7 @@ def _plain(report: Report, parallax: Mapping[str, float]) -> dict[str, Any]:
         for frame in report.frames.frames
     ]
     verdict = {"level": report.verdict.level, "findings": [asdict(finding) for finding in report.verdict.findings]}
-    return {"verdict": verdict, **measures, "frames_taken": frames}
+    return {"verdict": verdict, "notes": report.frames.notes, **measures, "frames_taken": frames}
 
 
 def _verdict(verdict: Verdict) -> str:

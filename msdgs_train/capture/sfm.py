@@ -200,7 +200,7 @@ def summary(model: pycolmap.Reconstruction, method: str, others: list[int], rota
     return Summary(
         names=np.array([image.name for image in images], dtype=str),
         camera_to_world=poses,
-        intrinsics=np.array([camera.params for camera in cameras], float).reshape(len(images), -1),
+        intrinsics=np.array([camera.params for camera in cameras], float).reshape(-1, 4),
         points=np.array([point.xyz for point in points]).reshape(-1, 3),
         colors=np.array([point.color for point in points], np.uint8).reshape(-1, 3),
         observations=np.array(seen, np.int64).reshape(-1, 2),
