@@ -44,6 +44,7 @@ def write_clip(
     muxer: dict[str, str] | None = None,
     metadata: dict[str, str] | None = None,
     sound: np.ndarray | None = None,
+    interlaced: bool = False,
     **colors: int,
 ) -> Path:
     """Write a video; `times` in seconds, `turn` in degrees, `sound` [N] in -1 to 1 at 16 kHz."""
@@ -56,6 +57,8 @@ def write_clip(
         stream.codec_context.time_base = Fraction(1, rate if path.suffix == ".avi" else TICKS)
         for name, value in colors.items():
             setattr(stream.codec_context, name, value)
+        if interlaced:
+            stream.codec_context.flags |= av.codec.context.Flags.interlaced_dct
         if turn:
             stream.set_display_rotation(turn)
         audio: Any = None if sound is None else container.add_stream("aac", rate=16000, layout="mono")
