@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pycolmap
 
+from msdgs_train.capture.rotation import Pair, beyond_rotation
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, UndistortedJob
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 
@@ -27,6 +28,8 @@ MAX_EXTRA_PARAMETER = 0.5
 """Of the distortion; models with more are wrong ones of few images."""
 MIN_MODEL = 3
 """Images of the smallest model."""
+MIN_MATCHES = 30
+"""Of a pair of images that tells whether the camera only turned."""
 ENOUGH = 0.95
 """Part of the images in one model below which the global mapper is tried, too."""
 BATCH = 16
@@ -70,7 +73,7 @@ def find(job: PosesJob) -> None:
     sparse.mkdir()
     largest.write(sparse)
     sizes = [model.num_reg_images() for model in models]
-    summary(largest, method, sizes[1:], _rotation_only(database)).save(workspace / GEOMETRY)
+    summary(largest, method, sizes[1:], _beyond_rotation(database)).save(workspace / GEOMETRY)
     database.unlink()
 
 
@@ -185,7 +188,7 @@ def _spread_to_frames(model: pycolmap.Reconstruction, cameras: Sequence[CameraVi
             model.add_image_with_trivial_frame(copy, image.cam_from_world())
 
 
-def summary(model: pycolmap.Reconstruction, method: str, others: list[int], rotation_only: float) -> Summary:
+def summary(model: pycolmap.Reconstruction, method: str, others: list[int], beyond_rotation: float) -> Summary:
     """What `sparse_model` keeps of a model."""
     images = sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
     ids = sorted(model.points3D)
@@ -207,7 +210,7 @@ def summary(model: pycolmap.Reconstruction, method: str, others: list[int], rota
         error=model.compute_mean_reprojection_error() if points else 0.0,
         method=method,
         others=tuple(others),
-        rotation_only=rotation_only,
+        beyond_rotation=beyond_rotation,
     )
 
 
@@ -230,13 +233,25 @@ def write_undistorted(job: UndistortedJob) -> None:
     model.write(job.out)
 
 
-def _rotation_only(database: Path) -> float:
-    """Part of the verified pairs of images that a rotation of the camera alone explains."""
+def _beyond_rotation(database: Path) -> float:
+    """Displacement that no rotation of the camera explains, of matches of pairs of one camera's images, in pixels."""
     with pycolmap.Database.open(database) as opened:
-        kinds = [geometry.config for geometry in opened.read_two_view_geometries()[1]]
-    known = pycolmap.TwoViewGeometryConfiguration
-    verified = [kind for kind in kinds if kind not in (known.UNDEFINED, known.DEGENERATE)]
-    return sum(kind == known.PANORAMIC for kind in verified) / max(len(verified), 1)
+        images = {image.image_id: image for image in opened.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        pairs, long_side = [], 1
+        for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            one, other = pycolmap.pair_id_to_image_pair(key)
+            camera = cameras[images[one].camera_id]
+            if images[one].camera_id != images[other].camera_id or len(geometry.inlier_matches) < MIN_MATCHES:
+                continue
+            long_side = max(camera.width, camera.height)
+            middle = np.array([camera.width, camera.height]) / 2
+            places = [
+                (opened.read_keypoints(image)[rows, :2] - middle) / long_side
+                for image, rows in zip((one, other), geometry.inlier_matches.T, strict=True)
+            ]
+            pairs.append(Pair(*places))
+    return long_side * beyond_rotation(pairs)
 
 
 def _tolerance(database: Path) -> float:
