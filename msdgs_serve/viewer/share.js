@@ -1,6 +1,6 @@
 // Exports a frame as a command, a file or a URL.
 
-import { readKey } from "./api.js";
+import { readKey } from "./service/api.js";
 import { short } from "./camera.js";
 
 /** Return the curl command for the frame, without the API key. */

@@ -1,23 +1,23 @@
 // The page: its state and the connections between its parts.
 
 import { getJson, isMissing, keepKey, readKey, scenePath } from "./api.js";
-import { Camera } from "./camera.js";
+import { Camera } from "../camera.js";
 import { Connection } from "./connection.js";
-import { Controls } from "./controls.js";
+import { Controls } from "../controls.js";
 import { drawDiagram } from "./diagram.js";
 import { Exports } from "./exports.js";
-import { showFacts } from "./facts.js";
+import { showFacts } from "../facts.js";
 import { Frames } from "./frames.js";
-import { Layers } from "./layers.js";
+import { Layers } from "../layers.js";
 import { NO_SCENES, noScene, noView, sceneGone } from "./messages.js";
 import { Pace } from "./pace.js";
-import { Player } from "./player.js";
+import { Player } from "../player.js";
 import { frameBody } from "./request.js";
 import { SceneList } from "./scenes.js";
-import { fromHash, toHash } from "./share.js";
-import { Stage } from "./stage.js";
-import { Timeline } from "./timeline.js";
-import { Views } from "./views.js";
+import { fromHash, toHash } from "../share.js";
+import { Stage } from "../stage.js";
+import { Timeline } from "../timeline.js";
+import { Views } from "../views.js";
 
 const REFRESH_EVERY = 3000; // milliseconds, for changed scenes
 

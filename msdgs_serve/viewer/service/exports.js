@@ -2,7 +2,7 @@
 
 import { call, render, scenePath } from "./api.js";
 import { frameBody, numbersBody } from "./request.js";
-import { copy, curlCommand, linkTo, save } from "./share.js";
+import { copy, curlCommand, linkTo, save } from "../share.js";
 
 const TOLD_FOR = 2500; // milliseconds
 const DIALOG_TITLES = { link: "The link to this view", curl: "The command for this frame" };
