@@ -1,56 +1,44 @@
-// The page: its state and the connections between its parts.
+// The page of the service: its scenes, and who draws them.
 
+import { say } from "../banner.js";
+import { Exports } from "../exports.js";
+import { fromHash } from "../share.js";
+import { Viewer } from "../viewer.js";
 import { getJson, isMissing, keepKey, readKey, scenePath } from "./api.js";
-import { Camera } from "../camera.js";
+import { Choice } from "./choice.js";
 import { Connection } from "./connection.js";
-import { Controls } from "../controls.js";
 import { drawDiagram } from "./diagram.js";
-import { Exports } from "./exports.js";
-import { showFacts } from "../facts.js";
 import { Frames } from "./frames.js";
-import { Layers } from "../layers.js";
-import { NO_SCENES, noScene, noView, sceneGone } from "./messages.js";
+import { NO_SCENES, noScene, sceneGone } from "./messages.js";
 import { Pace } from "./pace.js";
-import { Player } from "../player.js";
 import { frameBody } from "./request.js";
 import { SceneList } from "./scenes.js";
-import { fromHash, toHash } from "../share.js";
-import { Stage } from "../stage.js";
-import { Timeline } from "../timeline.js";
-import { Views } from "../views.js";
+import { takesOf } from "./takes.js";
 
 const REFRESH_EVERY = 3000; // milliseconds, for changed scenes
 
 const find = (id) => document.getElementById(id);
-const layers = new Layers({ changed: () => changed() });
-const views = new Views(find("view"), setView);
-const state = {
-  scene: null, camera: null, player: new Player(), layers,
-  get view() { return views.current; },
-}; // prettier-ignore
-const pace = new Pace();
-const stage = new Stage(find("image"), find("status"));
-const timeline = new Timeline(state.player, { changed: () => changed(), started: run });
-const connection = new Connection(find("banner"), { recovered: lookAgain, keyNeeded });
+const viewer = new Viewer({ shown });
+const connection = new Connection({ recovered: lookAgain, keyNeeded });
 const scenes = new SceneList(find("scenes"), { open: choose, isIdle });
-const controls = new Controls(find("image"), { camera: () => state.camera, moved: () => moved(), command });
 const frames = new Frames(
   {
-    size: () => stage.size(state),
-    body: () => frameBody(state),
-    isPlaying: () => state.player.playing,
-    isMoving: () => state.player.playing || controls.flying.size > 0,
-    show,
+    size: () => viewer.stage.size(viewer),
+    body: () => frameBody(viewer),
+    isPlaying: () => viewer.player.playing,
+    isMoving: () => viewer.isMoving,
+    show: (bitmap, facts) => {
+      viewer.stage.show(bitmap, facts);
+      viewer.shown(facts);
+    },
     failed: (error) => connection.failed(error),
   },
-  pace,
+  new Pace(),
 );
-new Exports({ state: () => state, size: () => frames.fullSize(), guarded });
+const choice = new Choice(viewer, frames, (error) => connection.failed(error));
 let asked = {}; // what the address or a click has asked for last
 let opening = null; // the AbortController of a scene that is being opened
 let needsKey = false; // whether the service has asked for a key, until the user acts
-let isFast = false;
-let running = 0;
 
 function choose(name) {
   asked = { scene: name };
@@ -70,76 +58,31 @@ async function open(name, look = {}) {
     if (!signal.aborted) opening = null;
   }
   needsKey = false;
-  const isAnother = state.scene?.name !== name;
-  state.scene = scene;
-  document.body.classList.remove("empty");
-  state.player.open(scene);
-  timeline.open();
-  stage.open(scene.background, isAnother);
-  if (isAnother) {
-    state.camera = new Camera(scene.view);
-    state.camera.aspect = stage.aspect();
-    state.player.seek(0);
-    layers.set(null);
-  } else state.camera.setView(scene.view);
-  layers.open(scene.steps);
-  const { sceneCamera } = state.camera;
-  state.camera.sceneCamera = null; // unless the file still has it, maybe with another pose
-  applyLook({ sceneCamera });
-  applyLook(look);
-  const wanted = look.view ?? views.current;
-  notice(views.open(scene, wanted) ? "" : noView(wanted));
-  describe();
-  connection.say("");
-  frames.paused = false;
-  frames.change({ cut: true });
-  return showReport(scene);
+  say("");
+  document.title = `${scene.name} · msdgs`;
+  find("title").textContent = scene.name;
+  scenes.mark(scene.name);
+  find("docs").hidden = readKey() !== ""; // a link sends no key
+  await Promise.all([choice.guarded(() => viewer.open(scene, look)), showReport(scene)]);
 }
 
 /** Show no scene, but why, and the list. */
 function closeScene(reason) {
-  state.scene = state.camera = null;
-  state.player.playing = false;
-  frames.stop();
-  document.body.classList.add("empty");
+  viewer.close();
   document.title = find("title").textContent = "msdgs";
   scenes.mark(null);
-  notice("");
-  connection.say(reason);
+  say(reason);
 }
 
 /** Open the current scene again, unless another one is being opened. */
 async function reopen() {
-  if (!opening) await open(state.scene.name);
-}
-
-function applyLook({ t = null, steps, at = null, sceneCamera = null }) {
-  if (t !== null) state.player.seekTime(t);
-  if (steps !== undefined) layers.set(steps); // null in an address without them: all
-  if (at) state.camera.reset();
-  if (at) [state.camera.azimuth, state.camera.elevation, state.camera.distance] = at;
-  if (at) state.camera.target = at.slice(3);
-  if (sceneCamera in state.scene.cameras) state.camera.take(state.scene.cameras[sceneCamera], sceneCamera);
-}
-
-function describe() {
-  const { scene } = state;
-  document.title = `${scene.name} · msdgs`;
-  find("title").textContent = scene.name;
-  scenes.mark(scene.name);
-  showFacts(find("facts"), scene);
-  const options = scene.cameras.map((camera, i) => new Option(camera.name, i));
-  find("camera").replaceChildren(new Option("Free view", ""), ...options);
-  find("camera").hidden = scene.cameras.length === 0;
-  find("camera").value = state.camera.sceneCamera ?? "";
-  find("docs").hidden = readKey() !== ""; // a link sends no key
-  timeline.show();
+  if (!opening) await open(viewer.scene.name);
 }
 
 async function showReport({ name, report: isThere }) {
   const section = find("report");
   const report = isThere ? await getJson(`${scenePath(name)}/report`).catch(() => null) : null;
-  if (state.scene?.name !== name) return;
+  if (viewer.scene?.name !== name) return;
   section.hidden = !report?.points?.length;
   if (section.hidden) return;
   const { processor, threads } = report.machine;
@@ -147,71 +90,16 @@ async function showReport({ name, report: isThere }) {
   drawDiagram(find("diagram"), report, (text) => (find("report-point").textContent = text));
 }
 
-/** The view has changed. */
-function changed() {
-  if (state.camera) frames.change();
-}
-
-function moved() {
-  find("camera").value = state.camera.sceneCamera ?? "";
-  changed();
-  if (controls.flying.size > 0) run();
-}
-
-function show(bitmap, facts) {
-  stage.show(bitmap, facts);
-  if (frames.refused) connection.say("");
-  if (!facts.full) return;
-  history.replaceState(null, "", toHash(state));
-  if (facts.isNews) guarded(reopen);
-  if (facts.isNews) scenes.renew(state.scene.name);
+function shown({ full, isNews }) {
+  if (frames.refused) say("");
+  if (!full || !isNews) return;
+  guarded(reopen);
+  scenes.renew(viewer.scene.name);
 }
 
 /** Whether thumbnails may be rendered now. */
 function isIdle() {
-  return !connection.isLost && (frames.shown || frames.paused || frames.refused) && !frames.isBusy;
-}
-
-/** Advance playback and flight with animation frames, while either is active. */
-function run() {
-  if (running) return;
-  let before = performance.now();
-  const tick = (now) => {
-    const seconds = Math.min(Math.max(now - before, 0) / 1000, 0.5);
-    before = now;
-    if (state.player.playing && !connection.isLost) {
-      state.player.advance(seconds);
-      timeline.show();
-      changed();
-    }
-    const isFlying = controls.advance(seconds, isFast);
-    running = state.player.playing || isFlying ? requestAnimationFrame(tick) : 0;
-  };
-  running = requestAnimationFrame(tick);
-}
-
-function command(key) {
-  const view = views.names[Number(key) - 1];
-  const { changes } = state.player;
-  if (view) setView(view);
-  else if (key === " " && changes) timeline.toggle();
-  else if (key === "," && changes) timeline.step(-1);
-  else if (key === "." && changes) timeline.step(1);
-  else if (key === "r") resetCamera();
-  else if (key === "?") find("help").showModal();
-  else return false;
-  return true;
-}
-
-function setView(view) {
-  notice(views.show(view) ? "" : noView(view));
-  frames.change({ cut: true });
-}
-
-function resetCamera() {
-  if (!state.camera) return;
-  state.camera.reset();
-  moved();
+  return !connection.isLost && viewer.source.isIdle;
 }
 
 /** Check for added, changed and removed scenes. */
@@ -219,21 +107,22 @@ async function lookAgain() {
   if (document.hidden || connection.isLost || needsKey) return;
   await guarded(async () => {
     await scenes.refresh();
-    scenes.mark(state.scene?.name);
-    if (opening) return;
-    if (!state.scene) await start(asked);
-    else if (!scenes.names.includes(state.scene.name)) {
-      frames.paused = true;
-      connection.say(sceneGone(state.scene.name));
-    } else if (frames.paused || (await isReplaced())) await reopen();
+    scenes.mark(viewer.scene?.name);
+    if (opening || viewer.source.isLoading) return;
+    if (!viewer.scene) await start(asked);
+    else if (!scenes.names.includes(viewer.scene.name)) {
+      viewer.source.paused = true;
+      say(sceneGone(viewer.scene.name));
+    } else if (viewer.source.paused || (await isReplaced())) await reopen();
     else await frames.check();
   });
 }
 
-/** Whether the current scene, a frame of which was refused, has another file now. */
+/** Whether the current scene has another file now; the service tells with its frames, unless it refused the last one. */
 async function isReplaced() {
-  const { name, sha256 } = state.scene;
-  return frames.refused && (await getJson(scenePath(name))).sha256 !== sha256;
+  if (viewer.source === frames && !frames.refused) return false;
+  const { name, sha256 } = viewer.scene;
+  return (await getJson(scenePath(name))).sha256 !== sha256;
 }
 
 /** Show what the address asks for, or say that it isn't there. */
@@ -259,36 +148,16 @@ function keyNeeded() {
   find("key-dialog").showModal();
 }
 
-function notice(text) {
-  find("notice").textContent = text;
+function useKey() {
+  keepKey(find("key").value.trim());
+  say("");
+  needsKey = false;
+  guarded(start);
 }
 
-function listen() {
-  find("reset").addEventListener("click", resetCamera);
-  find("camera").addEventListener("change", ({ target }) => {
-    if (target.value === "") return;
-    const index = Number(target.value);
-    state.camera.take(state.scene.cameras[index], index);
-    moved();
-  });
-  for (const button of document.querySelectorAll("[data-opens]")) {
-    button.addEventListener("click", () => find(button.dataset.opens).showModal());
-  }
-  find("key-form").addEventListener("submit", () => {
-    keepKey(find("key").value.trim());
-    connection.say("");
-    needsKey = false;
-    guarded(start);
-  });
-  for (const event of ["keydown", "keyup"]) document.addEventListener(event, ({ shiftKey }) => (isFast = shiftKey));
-  window.addEventListener("hashchange", () => guarded(() => start()));
-  stage.onResize(() => {
-    if (state.camera) state.camera.aspect = stage.aspect();
-    if (!frames.refused) changed(); // a message that appears resizes the image too
-  });
-  setInterval(lookAgain, REFRESH_EVERY);
-}
-
+new Exports(takesOf(viewer, () => frames.fullSize()), (action) => viewer.scene && guarded(action));
 find("key").value = readKey();
-listen();
+find("key-form").addEventListener("submit", useKey);
+window.addEventListener("hashchange", () => guarded(() => start()));
+setInterval(lookAgain, REFRESH_EVERY);
 guarded(start);
