@@ -48,6 +48,13 @@ export class Stage {
     this.context.drawImage(bitmap, 0, 0);
   }
 
+  /** Return a new canvas that covers the image; pointers and keys pass through it. */
+  addCanvas() {
+    const canvas = document.createElement("canvas");
+    this.canvas.after(canvas);
+    return canvas;
+  }
+
   onResize(action) {
     new ResizeObserver(action).observe(this.canvas);
   }

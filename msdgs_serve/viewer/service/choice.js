@@ -1,38 +1,44 @@
 // The choice of who draws, which the page offers if the service has the files of onnxruntime-web.
 
-import { LocalSource } from "../local/source.js";
 import { call, received, scenePath } from "./api.js";
 
 export class Choice {
   /** `frames` draws until the user chooses otherwise; `failed(error)` tells of errors. */
   constructor(viewer, frames, failed) {
-    const { runtime } = document.documentElement.dataset;
-    Object.assign(this, { viewer, frames, failed });
+    Object.assign(this, { viewer, frames, failed, local: null });
+    this.runtime = document.documentElement.dataset.runtime;
     this.form = document.getElementById("source");
-    this.form.hidden = runtime === undefined;
-    this.local = new LocalSource(viewer, { runtime, file });
-    this.form.addEventListener("change", ({ target }) => this.#choose(target.value));
+    this.form.hidden = this.runtime === undefined;
+    this.form.addEventListener("change", ({ target }) => this.guarded(() => this.#choose(target.value)));
     viewer.use(frames);
   }
 
-  /** Open a scene by the chosen source, or by the service if this browser can't draw it. */
+  /** Do what needs the chosen source; if this browser can't, say why, and let the service draw. */
   async guarded(action) {
     try {
       await action();
     } catch (error) {
       if (this.viewer.source === this.frames) throw error;
-      this.failed(error);
       this.form.elements.source.value = "service";
       await this.#choose("service");
+      this.failed(error);
     }
   }
 
   async #choose(name) {
     const { viewer } = this;
-    viewer.use(name === "local" ? this.local : this.frames);
+    viewer.use(name === "local" ? await this.#local() : this.frames);
     if (!viewer.scene) return;
     viewer.offerViews();
-    await this.guarded(() => viewer.source.open(viewer.scene));
+    await viewer.source.open(viewer.scene);
+  }
+
+  async #local() {
+    if (!this.local) {
+      const { LocalSource } = await import("../local/source.js");
+      this.local = new LocalSource(this.viewer, { runtime: this.runtime, file });
+    }
+    return this.local;
   }
 }
 

@@ -6,9 +6,8 @@ import { Refusal, received, render } from "./api.js";
 const FULL_AFTER = 150; // milliseconds
 const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
 const MIN_PIXELS = 64 * 64;
+const STAGES = ["pose", "draw", "encode"]; // of the service, that are told
 const MAX_REQUESTS = 2; // in flight during playback: the next one hides the way to the service
-
-const STAGES = ["pose", "draw", "encode"];
 
 /** The source of pixels that the service is. */
 export class Frames {
