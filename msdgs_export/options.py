@@ -111,6 +111,8 @@ class ConvertOptions:
 
     msdgs-convert ball.onnx small.onnx        the scene file itself, with arrays in fewer bits
 
+    msdgs-convert ball.onnx site/ --site      a folder that any file server shows in a browser
+
     For videos use msdgs-render: msdgs-render ball.onnx turn.mp4. docs/formats.md lists what each format keeps.
     """
 
@@ -125,6 +127,16 @@ class ConvertOptions:
     min_psnr: Annotated[float | None, optional("DB")] = None
     """PSNR of the written file against the scene, below which it isn't kept; by default 45 for SPZ and Visionary,
     50 for scene files, and 60 for the others, which are lossless."""
+    site: Flag = False
+    """Write a folder of files with a page that draws the scene in browsers, and no server."""
+    title: Annotated[str | None, optional("TEXT")] = None
+    """The title of a site's page; by default the scene's name."""
+    description: Annotated[str | None, optional("TEXT")] = None
+    """What search engines and links say of a site."""
+    url: Annotated[str | None, optional("URL")] = None
+    """The address that a site's folder will have, so that links to it show its picture."""
+    onnxruntime_web: Annotated[Path | None, optional("DIR")] = None
+    """Folder of the npm package onnxruntime-web, whose files a site holds; by default npm fetches it the first time."""
 
 
 def with_values_of_up(arguments: Sequence[str]) -> list[str]:
