@@ -147,9 +147,9 @@ export class Viewer {
     this.timeline.show();
   }
 
-  /** Advance playback and flight with animation frames, while either is active. */
+  /** Advance playback and flight with animation frames, while either is active and the page is visible. */
   #run() {
-    if (this.running) return;
+    if (this.running || document.hidden) return;
     let before = performance.now();
     const tick = (now) => {
       const seconds = Math.min(Math.max(now - before, 0) / 1000, 0.5);
@@ -160,7 +160,8 @@ export class Viewer {
         this.changed();
       }
       const isFlying = this.controls.advance(seconds, this.isFast);
-      this.running = this.player.playing || isFlying ? requestAnimationFrame(tick) : 0;
+      const goesOn = (this.player.playing || isFlying) && !document.hidden;
+      this.running = goesOn ? requestAnimationFrame(tick) : 0;
     };
     this.running = requestAnimationFrame(tick);
   }
@@ -205,6 +206,7 @@ export class Viewer {
       button.addEventListener("click", () => find(button.dataset.opens).showModal());
     }
     for (const event of ["keydown", "keyup"]) document.addEventListener(event, ({ shiftKey }) => (this.isFast = shiftKey));
+    document.addEventListener("visibilitychange", () => this.isMoving && this.#run());
     this.stage.onResize(() => {
       if (this.camera) this.camera.aspect = this.stage.aspect();
       if (!this.source?.refused) this.changed(); // a message that appears resizes the image too

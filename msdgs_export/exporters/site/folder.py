@@ -42,6 +42,8 @@ def write_site(session: DeformationSession, options: ConvertOptions, console: Co
     `RuntimeMissing` and `WriteFailed`.
     """
     out = options.out
+    if options.t is not None:
+        raise InvalidInput("t", "left out for a site, which shows all times", options.t)
     text = _text(session, options)
     _check_replaceable(out)
     files = _files(session, options, text, site_runtime(options.onnxruntime_web, console))

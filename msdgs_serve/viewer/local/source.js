@@ -37,6 +37,7 @@ export class LocalSource {
     if (number !== this.number) return;
     this.paused = false;
     this.change();
+    await this.#rest(this.engine);
   }
 
   /** Draw the viewer's view in the next animation frame. */
@@ -122,7 +123,8 @@ export class LocalSource {
     this.progress.max = total || 1;
     if (total) this.progress.value = loaded;
     else this.progress.removeAttribute("value");
-    this.viewer.stage.status.textContent = `Loading ${size(loaded)}${total ? ` of ${size(total)}` : ""}`;
+    const amount = `${size(loaded)}${total ? ` of ${size(total)}` : ""}`;
+    this.viewer.stage.status.textContent = loaded === total ? "Opening the scene…" : `Loading ${amount}`;
   }
 
   async #rest(engine) {

@@ -10,7 +10,7 @@ import { description, sceneFile } from "./files.js";
 const RUNTIME = "onnxruntime-web/";
 const IS_CALM = matchMedia("(prefers-reduced-motion: reduce)").matches;
 
-const viewer = new Viewer({ shown: ({ full }) => full && document.getElementById("preview")?.remove() });
+const viewer = new Viewer({ shown: () => document.getElementById("preview")?.remove() });
 const source = new LocalSource(viewer, { runtime: RUNTIME, file: sceneFile });
 viewer.use(source);
 
