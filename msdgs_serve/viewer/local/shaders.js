@@ -2,30 +2,37 @@
 
 export const ROW_BITS = 12; // 2^12 texels in a row of a texture
 
-/** Numbers of a splat, which `project` writes and `blend` reads: attribute name and length. */
-export const SPLAT = [
-  ["center", 2],
-  ["axes", 4],
-  ["color", 4],
-];
+/** Quads that 16-bit indices address. */
+export const BATCH = 1 << 14;
 
-/** Samplers in the order of their texture units. Those of poses are for the earlier and the later one. */
+/** What doesn't depend on time, and what does in all moving scenes. */
 export const STILL = ["means", "quats", "scales", "opacities", "sh"];
+export const MOVING = ["means", "quats", "scales"];
+
+/** Samplers of `projectShader` in the order of their texture units; of poses the earlier and the later one. */
+export const samplersOf = (posed) => ["order", ...STILL, ...posed.flatMap((name) => [`${name}A`, `${name}B`])];
 
 const ALPHA_MIN = "(1.0 / 255.0)";
 const ALPHA_MAX = "0.999";
 const NEAR_PLANE = "0.01";
 
-/** The vertex shader of a pass that projects Gaussians, one per vertex. `changing`: those of opacities and SH that
- * depend on time. */
-export function projectShader({ degree, changing }) {
-  const posed = ["means", "quats", "scales", ...changing];
-  const samplers = [...STILL, ...posed.flatMap((name) => [`${name}A`, `${name}B`])];
-  const changes = (name) => changing.includes(name);
+/** A triangle over all of a target. */
+export const EVERYWHERE = `#version 300 es
+void main() {
+  gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0.0, 1.0);
+}`;
+
+/** The fragment shader of a pass that projects Gaussians: one splat per texel, in the order in which they are blended.
+ * `posed`: what depends on time. */
+export function projectShader({ degree, posed }) {
+  const changes = (name) => posed.includes(name);
   return `#version 300 es
 precision highp float;
+precision highp int;
 precision highp sampler2D;
-${samplers.map((name) => `uniform sampler2D ${name};`).join("\n")}
+uniform highp usampler2D order;
+${samplersOf(posed).slice(1).map((name) => `uniform sampler2D ${name};`).join("\n")}
+uniform int found; // Gaussians in the order
 uniform int moving; // Gaussians, which come first
 uniform float share; // of the way from pose A to pose B
 uniform mat3 rotation; // world to camera
@@ -36,10 +43,8 @@ uniform float eps2d;
 uniform bool mip;
 uniform int channel; // 0: color, 1: alpha, 2: depth
 uniform vec2 depths; // of the depth channel: nearest, farthest
-layout(location = 0) in uint id;
-out vec2 center; // pixels
-out vec4 axes; // half-axes of the ellipse at one standard deviation, pixels
-out vec4 color; // and opacity, 0 if it isn't drawn
+layout(location = 0) out uvec4 placed; // center and the longer half-axis at one standard deviation, pixels
+layout(location = 1) out uvec4 painted; // the other half-axis, and color and opacity as halves; 0 if it isn't drawn
 
 vec4 at(sampler2D texture_, int k) {
   return texelFetch(texture_, ivec2(k & ${(1 << ROW_BITS) - 1}, k >> ${ROW_BITS}), 0);
@@ -67,7 +72,10 @@ ${harmonics(degree)}
 }
 
 void main() {
-  int i = int(id), k = i - moving;
+  placed = painted = uvec4(0u);
+  ivec2 texel = ivec2(gl_FragCoord.xy);
+  if (texel.x + (texel.y << ${ROW_BITS}) >= found) return;
+  int i = int(texelFetch(order, texel, 0).r), k = i - moving;
   vec3 mean, sizes;
   vec4 q;
   if (i < moving) {
@@ -81,13 +89,11 @@ void main() {
     q = at(quats, k);
   }
   float opacity = opacityOf(i);
-  center = vec2(0.0);
-  axes = color = vec4(0.0);
 
   vec3 p = rotation * (mean - eye);
   if (p.z <= ${NEAR_PLANE} || opacity < ${ALPHA_MIN}) return;
   vec2 ratio = p.xy / p.z, perPixel = focal / p.z;
-  center = ratio * focal + principal;
+  vec2 center = ratio * focal + principal;
   vec2 sheared = -perPixel * clamp(ratio, limits.xy, limits.zw);
   mat3x2 jacobian = mat3x2(perPixel.x, 0.0, 0.0, perPixel.y, sheared);
 
@@ -116,10 +122,12 @@ void main() {
   float half_ = 0.5 * (xx - yy), radius = length(vec2(half_, xy)), large = 0.5 * (xx + yy) + radius;
   vec2 along = half_ > 0.0 ? vec2(radius + half_, xy) : vec2(xy, radius - half_);
   along = radius > 0.0 ? normalize(along) : vec2(1.0, 0.0);
-  axes = vec4(sqrt(large) * along, sqrt(det / large) * vec2(-along.y, along.x));
-  if (channel == 0) color = vec4(seenColor(i, normalize(mean - eye)), opacity);
-  else if (channel == 1) color = vec4(vec3(1.0), opacity);
-  else color = vec4(vec3(1.0 - 0.85 * clamp((p.z - depths.x) / (depths.y - depths.x), 0.0, 1.0)), opacity);
+  vec2 major = sqrt(large) * along, minor = sqrt(det / large) * vec2(-along.y, along.x);
+  vec3 color = vec3(1.0);
+  if (channel == 0) color = seenColor(i, normalize(mean - eye));
+  else if (channel == 2) color -= 0.85 * clamp((p.z - depths.x) / (depths.y - depths.x), 0.0, 1.0);
+  placed = floatBitsToUint(vec4(center, major));
+  painted = uvec4(floatBitsToUint(minor), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity)));
 }`;
 }
 
@@ -138,25 +146,28 @@ function harmonics(degree) {
   return bands.slice(0, degree).join("\n");
 }
 
-/** The fragment shader of the projection, of which nothing is rasterized. */
-export const NOTHING = `#version 300 es
-void main() {}`;
-
 /** A quad for each splat, up to where its alpha is below the cut-off. */
 export const BLEND_VERTEX = `#version 300 es
 precision highp float;
-layout(location = 0) in vec2 center;
-layout(location = 1) in vec4 axes;
-layout(location = 2) in vec4 color;
+precision highp int;
+uniform highp usampler2D placed, painted;
 uniform vec2 size;
+uniform int found;
 out vec2 place; // standard deviations
-flat out vec4 splat;
+flat out vec4 splat; // color and opacity
 void main() {
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0 - 1.0;
-  place = corner * sqrt(max(2.0 * log(255.0 * color.a), 0.0));
-  splat = color;
-  vec2 pixel = center + place.x * axes.xy + place.y * axes.zw;
-  gl_Position = vec4(pixel.x / size.x * 2.0 - 1.0, 1.0 - pixel.y / size.y * 2.0, 0.0, 1.0);
+  int k = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
+  place = vec2(0.0);
+  splat = gl_Position = vec4(0.0); // all corners at one point
+  if (k >= found) return;
+  ivec2 texel = ivec2(k & ${(1 << ROW_BITS) - 1}, k >> ${ROW_BITS});
+  uvec4 a = texelFetch(placed, texel, 0), b = texelFetch(painted, texel, 0);
+  splat = vec4(unpackHalf2x16(b.z), unpackHalf2x16(b.w));
+  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
+  place = corner * sqrt(max(2.0 * log(255.0 * splat.a), 0.0));
+  vec2 center = uintBitsToFloat(a.xy), major = uintBitsToFloat(a.zw), minor = uintBitsToFloat(b.xy);
+  vec2 pixel = (center + place.x * major + place.y * minor) / size;
+  gl_Position = vec4(pixel.x * 2.0 - 1.0, 1.0 - pixel.y * 2.0, 0.0, 1.0);
 }`;
 
 export const BLEND_FRAGMENT = `#version 300 es
