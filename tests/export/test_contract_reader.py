@@ -41,7 +41,7 @@ def check(output: str, file: Path) -> None:
     wanted = session.gaussians(0.5)
     for name in NAMES:
         expected = getattr(wanted, name)
-        assert np.abs(np.array(values[name]).reshape(expected.shape) - expected).max() < tolerance("onnx_pose"), name
+        assert np.abs(np.array(values[name]).reshape(expected.shape) - expected).max() < tolerance("read_pose"), name
     assert tuple(times) == session.scene.metadata.time_range
     assert json.loads(plan) == session.scene.metadata.plan
 

@@ -21,7 +21,9 @@ class Poser {
       self.postMessage({ kind: "progress", loaded: sum("bytes"), total: sums.every((x) => x.total) ? sum("total") : 0 });
     };
     const [ort, wasmBinary, bytes] = await Promise.all([
-      import(new URL(RUNTIME, runtime)),
+      import(new URL(RUNTIME, runtime)).catch(() => {
+        throw new Error(`onnxruntime-web can’t be loaded: ${RUNTIME} isn’t there.`);
+      }),
       download(String(new URL(BINARY, runtime)), "onnxruntime-web", tell("runtime")),
       download(scene, "The scene file", tell("scene")),
     ]);

@@ -20,7 +20,7 @@ export async function description() {
 export async function sceneFile({ file, sha256 }, tell = () => {}) {
   const name = `The scene’s file ${file.path}`;
   const bytes = await download(file.path, name, (loaded) => tell({ loaded, total: file.stored }));
-  if (bytes[0] !== FIRST_BYTE) throw new Error(`${name} isn’t a scene: it begins with other bytes. ${AGAIN}`);
+  if (bytes.length && bytes[0] !== FIRST_BYTE) throw new Error(`${name} isn’t a scene: it begins with other bytes. ${AGAIN}`);
   if (bytes.length < file.size) {
     throw new Error(`${name} ends too early: it was not copied or sent as a whole. ${AGAIN}`);
   }
