@@ -29,13 +29,14 @@ def page(browser: Browser) -> Iterator[Page]:
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of sites below the server's own."""
-    return tmp_path_factory.mktemp("sites") / "a path"
+    folder = tmp_path_factory.mktemp("sites") / "a path"
+    folder.mkdir()
+    return folder
 
 
 @pytest.fixture(scope="session")
 def site(folder: Path, scene: Path) -> Path:
     """The site of two balls, one of which moves; read-only."""
-    folder.mkdir()
     return write_site(scene, folder / "site", RUNTIME, title="Balls")
 
 

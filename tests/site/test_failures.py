@@ -10,7 +10,7 @@ from playwright.sync_api import Page, expect
 
 from tests.support.processes import wait_until_still
 from tests.support.scene_files import write_scene
-from tests.support.sites import needs_runtime
+from tests.support.sites import NO_WEBGL2, needs_runtime
 
 pytestmark = [pytest.mark.slow, needs_runtime]
 
@@ -88,10 +88,7 @@ def test_the_page_says_what_is_wrong_with_the_folder(
 
 
 def test_without_webgl2_it_says_so(page: Page, site: Path, server: str):
-    page.add_init_script(
-        "HTMLCanvasElement.prototype.getContext = new Proxy(HTMLCanvasElement.prototype.getContext, {"
-        "apply: (call, canvas, [kind, ...rest]) => (kind === 'webgl2' ? null : call.call(canvas, kind, ...rest)) });"
-    )
+    page.add_init_script(NO_WEBGL2)
     page.goto(f"{server}/site/")
     expect(page.locator("#banner")).to_contain_text("WebGL2")
 

@@ -27,6 +27,15 @@ from tests.support.processes import ROOT
 MODULES = ROOT / "tests" / "export" / "runtime" / "node_modules"
 RUNTIME = MODULES / "onnxruntime-web"
 
+NO_WEBGL2 = """{
+    const { prototype } = HTMLCanvasElement;
+    const { getContext } = prototype;
+    prototype.getContext = function (kind, ...rest) {
+        return kind === "webgl2" ? null : getContext.call(this, kind, ...rest);
+    };
+}"""
+"""Takes WebGL2 from a page."""
+
 needs_runtime = pytest.mark.skipif(
     not RUNTIME.is_dir(), reason=f"no {MODULES.relative_to(ROOT)}: `make {MODULES.relative_to(ROOT)}`"
 )
