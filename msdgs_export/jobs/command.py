@@ -41,6 +41,7 @@ NARROW_COLUMNS = ("", "plan", "pruned to", "SH", "moving", "ms", "MB", "worst fr
 
 def export(model: Path, options: ExportOptions, console: Console) -> None:
     """Choose a candidate, verify it and write it. An error leaves files that were there as they are."""
+    options = options.spelled_out
     _check(options)
     with scratch_folder() as folder, tracked(console) as track:
         images = _held_out_images(model, options.data, track)

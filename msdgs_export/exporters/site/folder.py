@@ -11,7 +11,7 @@ from rich.console import Console
 
 from msdgs_export.exporters.site.page import PREVIEW, PREVIEW_SIZE, PageText, folder_url, iframe, site_page
 from msdgs_export.exporters.site.runtime import site_runtime
-from msdgs_export.options import ConvertOptions
+from msdgs_export.options import WEB_MB, ConvertOptions
 from msdgs_serve.browser import PAGE, RUNTIME, viewer_files
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.description import described
@@ -30,8 +30,6 @@ AZIMUTH, ELEVATION = 30.0, 20.0
 """Of the view that the page opens with, degrees."""
 MIN_SAVED = 0.1
 """Part of the scene's bytes that gzip has to save: browsers take time to unpack it."""
-WEB_BYTES = 5_000_000
-"""Of a scene's file, above which a page is slow to load."""
 LICENSE = "LICENSE.txt"
 
 
@@ -145,7 +143,7 @@ def _tell(out: Path, text: PageText, files: dict[str, bytes], console: Console) 
         "then open http://localhost:8000",
         f"to show it in another page: {iframe(text, out.name)}",
     ]
-    if scene > WEB_BYTES:
+    if scene > 1e6 * WEB_MB:
         lines.append("msdgs-export --for-web writes a scene with fewer bytes")
     for line in lines:
         console.print(line, markup=False)
