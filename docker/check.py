@@ -186,7 +186,7 @@ def check_cache(url: str) -> None:
     expect((keyed.status, keyed.body) == (304, b""), "their own ETags count")
     expect(get(f"{url}/metrics").status == 404, "metrics are not public")
     expect(get(f"{url}/").status == 200, "the viewer is served")
-    expect(get(f"{url}/viewer/onnxruntime-web/ort.wasm.min.mjs").status == 200, "the viewer can draw by itself")
+    expect(get(f"{url}/viewer/onnxruntime-web/ort.js").status == 200, "the viewer can draw by itself")
 
 
 def check_revalidation(url: str) -> None:

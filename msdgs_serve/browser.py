@@ -10,18 +10,22 @@ VIEWER = Path(__file__).parent / "viewer"
 PAGE = "index.html"
 MEDIA_TYPES = {
     ".css": "text/css",
+    ".gz": "application/gzip",
     ".html": "text/html",
     ".js": "text/javascript",
-    ".mjs": "text/javascript",
     ".svg": "image/svg+xml",
     ".txt": "text/plain",
-    ".wasm": "application/octet-stream",  # gzipped
 }
 
 RUNTIME = "onnxruntime-web"
 """The npm package, and the folder that the viewer finds its files in."""
-RUNTIME_MODULES = ("ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs")
-RUNTIME_WASM = "ort-wasm-simd-threaded.wasm"
+RUNTIME_FILES = {
+    "ort.wasm.min.mjs": "ort.js",
+    "ort-wasm-simd-threaded.mjs": "ort-wasm.js",
+    "ort-wasm-simd-threaded.wasm": "ort-wasm.wasm.gz",
+}
+"""The package's files in its folder `dist`, and their names for pages: many servers send `.mjs` as a type that browsers
+refuse in a script, and few compress wasm."""
 GZIP = b"\x1f\x8b"
 LICENSES = {"LICENSE": "LICENSE.txt", "ThirdPartyNotices.txt": "ThirdPartyNotices.txt"}
 """Of ONNX Runtime, which its Python package has and onnxruntime-web doesn't; and their names beside its files."""
@@ -34,20 +38,20 @@ def viewer_files() -> dict[str, bytes]:
 
 
 def runtime_files(folder: Path) -> dict[str, bytes]:
-    """The contents of what pages load of onnxruntime-web, by name: two modules, the wasm in gzip's format, licenses.
+    """The contents of what pages load of onnxruntime-web, and of its licenses, by the names for pages.
 
-    `folder` is the npm package, its folder `dist`, or one that was written from these contents. Raises `InvalidInput`.
+    `folder` is the npm package, or one with its three files, the wasm as it is or gzipped. Raises `InvalidInput`.
     """
     dist = folder / "dist" if (folder / "dist").is_dir() else folder
     try:
-        files = {name: (dist / name).read_bytes() for name in (*RUNTIME_MODULES, RUNTIME_WASM)}
+        files = {name: (dist / file).read_bytes() for file, name in RUNTIME_FILES.items()}
     except OSError as error:
-        wanted = f"a folder with {', '.join((*RUNTIME_MODULES, RUNTIME_WASM))}, as node_modules/{RUNTIME}/dist"
-        raise InvalidInput(
-            "onnxruntime_web", wanted, f"{folder}, where {Path(error.filename).name} can't be read"
-        ) from None
-    if not files[RUNTIME_WASM].startswith(GZIP):
-        files[RUNTIME_WASM] = gzip.compress(files[RUNTIME_WASM], mtime=0)
+        wanted = f"a folder with {', '.join(RUNTIME_FILES)}, as node_modules/{RUNTIME}/dist"
+        missing = Path(error.filename).name
+        raise InvalidInput("onnxruntime_web", wanted, f"{folder}, where {missing} can't be read") from None
+    for name, contents in files.items():
+        if name.endswith(".gz") and not contents.startswith(GZIP):
+            files[name] = gzip.compress(contents, mtime=0)
     return files | _licenses()
 
 

@@ -114,6 +114,11 @@ export class Viewer {
     this.source.change({ cut: true });
   }
 
+  /** Stop at the shown time. */
+  pause() {
+    if (this.player.playing) this.timeline.toggle();
+  }
+
   /** Whether the view goes on changing by itself. */
   get isMoving() {
     return this.player.playing || this.controls.flying.size > 0;

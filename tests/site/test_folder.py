@@ -15,13 +15,14 @@ from msdgs_export.exporters.command import convert
 from msdgs_export.exporters.site.page import POLICY, folder_url
 from msdgs_export.exporters.site.runtime import VERSION, RuntimeMissing, cache_folder
 from msdgs_export.options import ConvertOptions
-from msdgs_serve.browser import RUNTIME_MODULES, RUNTIME_WASM
+from msdgs_serve.browser import RUNTIME_FILES
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import WriteFailed
 from tests.support.images import decode
 from tests.support.processes import ROOT
 from tests.support.sites import stand_in, write_site
 
+*_, WASM = RUNTIME_FILES
 SCRIPT_BYTES = 80_000
 """Of our own scripts, compressed."""
 
@@ -73,7 +74,7 @@ def test_it_holds_all_that_the_page_needs_and_the_licenses(site: Path, scene: Pa
     assert set(description["files"]) == files
     assert {"LICENSE.txt", "onnxruntime-web/LICENSE.txt", "onnxruntime-web/ThirdPartyNotices.txt"} <= files
     assert (site / "LICENSE.txt").read_text() == (ROOT / "LICENSE").read_text()
-    assert {f"onnxruntime-web/{name}" for name in (*RUNTIME_MODULES, RUNTIME_WASM)} <= files
+    assert {f"onnxruntime-web/{name}" for name in RUNTIME_FILES.values()} <= files
     assert not any(path.startswith("viewer/service") for path in files)
     named = [value for _, each in page_of(site).elements for key in ("src", "href") if (value := each.get(key))]
     assert len(named) > 4
@@ -97,11 +98,15 @@ def test_the_scene_is_the_very_file_compressed_if_that_saves_bytes(
 
 
 def test_the_wasm_is_compressed_once(tmp_path: Path, scene: Path, runtime: Path):
-    (runtime / RUNTIME_WASM).write_bytes(b"\0asm" * 1000)
-    first = write_site(scene, tmp_path / "first", runtime) / "onnxruntime-web"
-    assert gzip.decompress((first / RUNTIME_WASM).read_bytes()) == b"\0asm" * 1000
-    again = write_site(scene, tmp_path / "again", first) / "onnxruntime-web"
-    assert (again / RUNTIME_WASM).read_bytes() == (first / RUNTIME_WASM).read_bytes()
+    contents = b"\0asm" * 1000
+    for number, stored in enumerate((contents, gzip.compress(contents))):
+        (runtime / WASM).write_bytes(stored)
+        site = write_site(scene, tmp_path / str(number), runtime)
+        assert gzip.decompress((site / "onnxruntime-web" / RUNTIME_FILES[WASM]).read_bytes()) == contents
+
+
+def test_servers_know_the_types_of_its_scripts(site: Path):
+    assert not list(site.rglob("*.mjs")), "nginx sends them as a type that browsers refuse"
 
 
 def test_the_preview_shows_the_scene_as_links_show_pictures(site: Path):
@@ -235,8 +240,8 @@ def test_its_options_are_for_sites_only(tmp_path: Path, scene: Path, option: dic
 
 
 def test_a_folder_without_the_runtime_is_refused(tmp_path: Path, scene: Path, runtime: Path):
-    (runtime / RUNTIME_WASM).unlink()
-    with pytest.raises(InvalidInput, match=f"{RUNTIME_WASM} can't be read"):
+    (runtime / WASM).unlink()
+    with pytest.raises(InvalidInput, match=f"{WASM} can't be read"):
         write_site(scene, tmp_path / "site", runtime)
 
 
@@ -249,7 +254,7 @@ mkdir -p node_modules/onnxruntime-web/dist && cd node_modules/onnxruntime-web/di
 
 def test_npm_fetches_the_runtime_once(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch):
     npm = tmp_path / "npm"
-    npm.write_text(NPM.format(files=" ".join((*RUNTIME_MODULES, RUNTIME_WASM))))
+    npm.write_text(NPM.format(files=" ".join(RUNTIME_FILES)))
     npm.chmod(0o755)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")

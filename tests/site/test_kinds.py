@@ -28,6 +28,12 @@ from tests.support.tolerances import tolerance
 pytestmark = [pytest.mark.slow, needs_runtime]
 
 
+@pytest.fixture(autouse=True)
+def _networks_are_read_in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not in a process of its own, which first loads torch."""
+    monkeypatch.setattr("msdgs_export.importers.runs.state.read_guarded", lambda read, file: read(file))
+
+
 def static(file: Path) -> None:
     file.write_bytes(static_scene(Splats(some_gaussians(500, 3)), "0" * 64).SerializeToString())
 

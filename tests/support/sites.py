@@ -15,7 +15,7 @@ from rich.console import Console
 
 from msdgs_export.exporters.command import convert
 from msdgs_export.options import ConvertOptions
-from msdgs_serve.browser import RUNTIME_MODULES, RUNTIME_WASM
+from msdgs_serve.browser import RUNTIME_FILES
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.imaging import encode
@@ -44,7 +44,7 @@ needs_runtime = pytest.mark.skipif(
 def stand_in(folder: Path) -> Path:
     """A folder with the files of onnxruntime-web, which contain nothing: for what no browser opens."""
     folder.mkdir()
-    for name in (*RUNTIME_MODULES, RUNTIME_WASM):
+    for name in RUNTIME_FILES:
         (folder / name).write_bytes(b"")
     return folder
 

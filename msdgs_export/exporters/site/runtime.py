@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from msdgs_serve.browser import RUNTIME, runtime_files
+from msdgs_serve.browser import RUNTIME, RUNTIME_FILES, runtime_files
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.writing import temporary_folder
 
@@ -67,6 +67,6 @@ def _fetch(kept: Path) -> None:
             raise RuntimeMissing(f"`npm ci` says: {told}")
         fetched = folder / RUNTIME
         fetched.mkdir()
-        for name, contents in runtime_files(folder / "node_modules" / RUNTIME).items():
-            (fetched / name).write_bytes(contents)
+        for name in RUNTIME_FILES:
+            shutil.move(folder / "node_modules" / RUNTIME / "dist" / name, fetched)
         fetched.rename(kept)

@@ -6,6 +6,7 @@ import { size } from "../numbers.js";
 import { CHANNELS, openEngine } from "./engine.js";
 
 const REST_AFTER = 150; // milliseconds without a change, after which a frame counts as one that stays
+const RUNTIME_FILES = ["ort.js", "ort-wasm.js", "ort-wasm.wasm.gz"]; // as msdgs_serve/browser.py names them
 const LOST = "The browser has taken the graphics from this page. It goes on when they are back.";
 
 export class LocalSource {
@@ -17,12 +18,13 @@ export class LocalSource {
   /**
    * @param {object} viewer
    * @param {object} files
-   * @param {string} files.runtime  address of the folder with onnxruntime-web's files
+   * @param {string} files.runtime  address of the folder with onnxruntime-web's files, a slash at its end
    * @param {(scene, tell) => Promise<ArrayBuffer>} files.file  the contents of a scene's file; it calls
    *   tell({ loaded, total }), bytes
    */
   constructor(viewer, { runtime, file }) {
-    Object.assign(this, { viewer, runtime, file });
+    const [module, glue, binary] = RUNTIME_FILES.map((name) => runtime + name);
+    Object.assign(this, { viewer, file, runtime: { module, glue, binary } });
     this.progress = document.getElementById("loading");
     this.number = 0; // of the scene that was opened last
     this.engine = null;
@@ -72,6 +74,7 @@ export class LocalSource {
 
   /** The image of the viewer's view, a Blob in PNG. */
   async png() {
+    if (!this.engine) throw new Error("There is no image yet.");
     const pixels = await this.engine.pixels();
     const image = new OffscreenCanvas(pixels.width, pixels.height);
     image.getContext("2d").putImageData(pixels, 0, 0);

@@ -32,11 +32,14 @@ async function guarded(action) {
 /** The functions of Exports. */
 const takes = {
   link: () => linkTo(viewer),
-  png: async () => ({ contents: await source.png(), name: `${viewer.scene.name}-${viewer.player.t}.png` }),
+  png: async () => {
+    viewer.pause();
+    return { contents: await source.png(), name: `${viewer.scene.name}-${viewer.player.t}.png` };
+  },
   onnx: async () => ({ contents: new Blob([await sceneFile(viewer.scene)]), name: `${viewer.scene.name}.onnx` }),
 };
 
 document.body.classList.toggle("embedded", window.parent !== window);
-new Exports(takes, guarded);
+new Exports(takes, (action) => viewer.scene && guarded(action));
 window.addEventListener("hashchange", () => viewer.scene && guarded(() => viewer.open(viewer.scene, fromHash(location.hash))));
 guarded(start);
