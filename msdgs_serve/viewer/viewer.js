@@ -20,6 +20,7 @@ const find = (id) => document.getElementById(id);
  * @property {boolean} paused  whether it shows nothing new, for now
  * @property {boolean} refused  whether this view can't be shown
  * @property {boolean} isIdle  whether it has shown what was asked for
+ * @property {boolean} [isLoading]  whether it is opening a scene
  * @property {(scene) => Promise<void>} open  show the viewer's scene, which may have another file now
  * @property {(how?: {cut: boolean}) => void} change  show the viewer's view; `cut`: frames on their way are useless
  * @property {() => void} stop

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import os
 import re
 from html.parser import HTMLParser
 from io import StringIO
@@ -60,7 +61,7 @@ def runtime(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def site(tmp_path: Path, scene: Path, runtime: Path) -> Path:
-    return write_site(scene, tmp_path / "site", runtime)
+    return write_site(scene, tmp_path / "a" / "new" / "site", runtime)
 
 
 def page_of(site: Path) -> Page:
@@ -167,6 +168,8 @@ def test_links_to_it_show_a_picture_if_its_address_is_known(tmp_path: Path, scen
         ("https://example.org", "https://example.org/"),
         ("http://localhost:8000/a/index.html", "http://localhost:8000/a/"),
         ("https://example.org/a%20b/", "https://example.org/a%20b/"),
+        ('https://user.github.io/é/"x"', "https://user.github.io/%C3%A9/%22x%22/"),
+        ("http://[::1]:80", "http://[::1]:80/"),
     ],
 )
 def test_addresses_are_those_of_the_folder(url: str, folder: str):
@@ -174,7 +177,19 @@ def test_addresses_are_those_of_the_folder(url: str, folder: str):
 
 
 @pytest.mark.parametrize(
-    "url", ["example.org/a", "ftp://example.org", "javascript:alert(1)", "https://", "/a", "", "https://a/?b"]
+    "url",
+    [
+        "example.org/a",
+        "ftp://example.org",
+        "javascript:alert(1)",
+        "https://",
+        "/a",
+        "",
+        "https://a/?b",
+        "https://a b/",
+        'https://a"/',
+        "https://[::1 /",
+    ],
 )
 def test_other_addresses_are_refused(tmp_path: Path, scene: Path, runtime: Path, url: str):
     with pytest.raises(InvalidInput, match=r"`?url`?"):
@@ -219,6 +234,24 @@ def test_an_interrupted_one_leaves_the_old_one(scene: Path, runtime: Path, site:
             write_site(scene, site, runtime, title="New")
     assert page_of(site).texts["title"] == old
     assert not list(site.parent.glob(".msdgs-*"))
+
+
+def test_one_that_cannot_take_its_place_leaves_the_old_one(
+    scene: Path, runtime: Path, site: Path, monkeypatch: pytest.MonkeyPatch
+):
+    replace, moved = os.replace, []
+
+    def failing(source: Path, target: Path) -> None:
+        moved.append(source)
+        if len(moved) == 2:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", failing)
+        with pytest.raises(KeyboardInterrupt):
+            write_site(scene, site, runtime, title="New")
+    assert page_of(site).texts["title"] == "balls"
 
 
 def test_it_tells_how_to_look_at_it(tmp_path: Path, scene: Path, runtime: Path):

@@ -45,14 +45,21 @@ def write_site(session: DeformationSession, options: ConvertOptions, console: Co
     text = _text(session, options)
     _check_replaceable(out)
     files = _files(session, options, text, site_runtime(options.onnxruntime_web, console))
-    with temporary_folder(out.absolute().parent, out) as folder:
+    parent = out.absolute().parent
+    parent.mkdir(parents=True, exist_ok=True)
+    with temporary_folder(parent, out) as folder:
         new, old = folder / "new", folder / "old"
         for path, contents in files.items():
             (new / path).parent.mkdir(parents=True, exist_ok=True)
             (new / path).write_bytes(contents)
         if out.is_dir():
             os.replace(out, old)
-        os.replace(new, out)
+        try:
+            os.replace(new, out)
+        except BaseException:
+            if old.is_dir():
+                os.replace(old, out)
+            raise
     _tell(out, text, files, console)
 
 

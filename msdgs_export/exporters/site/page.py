@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass
 from html import escape
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 from msdgs_serve.scene.errors import InvalidInput
 
@@ -15,6 +15,7 @@ POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'"
 )
+ADDRESS = re.compile(r"""(?P<host>https?://[^\s/?#"'<>\\]+)(?P<path>(/[^?#]*)?)""", re.IGNORECASE)
 OF_SERVICE = re.compile(r" *<!-- service -->\n.*?<!-- /service -->\n", re.DOTALL)
 
 
@@ -29,11 +30,11 @@ class PageText:
 
 def folder_url(url: str) -> str:
     """The address of a site's folder, with a slash at its end. Raises `InvalidInput` if it isn't one of the web."""
-    parts = urlsplit(url)
-    if parts.scheme not in ("http", "https") or not parts.netloc or parts.query or parts.fragment:
+    match = ADDRESS.fullmatch(url)
+    if match is None:
         raise InvalidInput("url", "the address of the folder, such as https://example.org/toys/", url)
-    path = parts.path.removesuffix("index.html").rstrip("/") + "/"
-    return f"{parts.scheme}://{parts.netloc}{quote(path, safe='/%~+,;=:@')}"
+    path = match["path"].removesuffix("index.html").rstrip("/") + "/"
+    return match["host"] + quote(path, safe="/%~+,;=:@")
 
 
 def site_page(viewer_page: str, text: PageText) -> str:
