@@ -42,7 +42,6 @@ def site_page(viewer_page: str, text: PageText) -> str:
     head, *_ = OF_SERVICE.findall(viewer_page)
     page = OF_SERVICE.sub("", viewer_page.replace(head, _head(text)))
     for old, new in (
-        ("<body>", '<body class="site">'),
         ('<h1 id="title">msdgs</h1>', f'<h1 id="title">{escape(text.title)}</h1>'),
         ('<progress id="loading"', f'<img id="preview" src="{PREVIEW}" alt="" />\n        <progress id="loading"'),
     ):
