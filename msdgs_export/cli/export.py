@@ -32,7 +32,7 @@ def export_or_import(options: ExportOptions, console: Console) -> None:
     _check(options, file_format)
     if file_format in TRAINED:
         with trained_model(path, file_format, console) as (model, lost):
-            export(model, options, console)
+            export(model, options.spelled_out, console)
         if lost:
             note_left_out(output, lost)
     else:
