@@ -10,35 +10,36 @@ from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.sparse_model import Summary
 
 MOST_POINTS = 6000
-REACH = 1.6
-"""Radius of what is drawn, in distances of the farthest camera from the points' median."""
+OUTLIERS, MARGIN = 3.0, 1.15
+"""Percent of the points that may lie outside at each side, and the side of what is drawn in extents of the others."""
 COLORS = ("#d1495b", "#00798c", "#edae49", "#66a182", "#2e4057", "#8d5a97")
 """Of cameras, in their order, again from the first."""
 
 
-def draw_path(model: Summary, cameras: np.ndarray) -> str:
+def draw_path(model: Summary, cameras: np.ndarray) -> list[str]:
     """Draw points and cameras from above and from the side; `cameras` is the camera of each image, [N]."""
     axes_to_view = _level(model)
-    middle = np.median(model.points, axis=0)
-    points, centers = (model.points - middle) @ axes_to_view.T, (model.centers - middle) @ axes_to_view.T
+    points, centers = model.points @ axes_to_view.T, model.centers @ axes_to_view.T
     forward = model.camera_to_world[:, :3, 2] @ axes_to_view.T
-    reach = REACH * float(np.linalg.norm(centers, axis=1).max())
+    low, high = np.percentile(points, OUTLIERS, axis=0), np.percentile(points, 100 - OUTLIERS, axis=0)
+    low, high = np.minimum(low, centers.min(axis=0)), np.maximum(high, centers.max(axis=0))
+    reach, middle = MARGIN * 0.5 * float((high - low).max()), 0.5 * (low + high)
     chosen = np.random.default_rng(0).permutation(len(points))[:MOST_POINTS]
-    chosen = chosen[np.linalg.norm(points[chosen], axis=1) < 2 * reach]
-    figure = Figure(figsize=(9, 4.4), layout="constrained")
-    for place, (title, rows) in zip(
-        figure.subplots(1, 2), {"from above": (0, 1), "from the side": (0, 2)}.items(), strict=True
-    ):
-        place.scatter(*points[chosen][:, rows].T, s=1.5, c=model.colors[chosen] / 255, linewidths=0, rasterized=True)
+    drawings = []
+    for title, rows in {"from above": (0, 1), "from the side": (1, 2)}.items():
+        figure = Figure(figsize=(4.5, 4.6), layout="constrained")
+        place, axes = figure.subplots(), list(rows)
+        place.scatter(*points[chosen][:, axes].T, s=2, c=model.colors[chosen] / 255, linewidths=0, rasterized=True)
         for camera in np.unique(cameras):
-            own = cameras == camera
-            color = COLORS[camera % len(COLORS)]
-            place.plot(*centers[own][:, rows].T, "-", color=color, linewidth=1, alpha=0.6)
-            place.quiver(
-                *centers[own][:, rows].T, *forward[own][:, rows].T, color=color, angles="xy", width=0.004, scale=22
-            )
-        _frame(place, title, reach)
-    return _svg(figure)
+            own, color = cameras == camera, COLORS[camera % len(COLORS)]
+            place.plot(*centers[own][:, axes].T, "-", color=color, linewidth=1)
+            directions = forward[own][:, axes]
+            place.quiver(*centers[own][:, axes].T, *directions.T, color=color, angles="xy", width=0.004, scale=16)
+        limits = [(middle[axis] - reach, middle[axis] + reach) for axis in axes]
+        place.set(title=title, xlim=limits[0], ylim=limits[1], aspect="equal", xticks=[], yticks=[])
+        place.spines[:].set_color("#cccccc")
+        drawings.append(_svg(figure))
+    return drawings
 
 
 def draw_parallax(frames: FrameSet, parallax: dict[str, float]) -> str:
@@ -69,11 +70,6 @@ def _level(model: Summary) -> np.ndarray:
     right = level @ np.linalg.svd(offsets, full_matrices=False)[2][0]
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(up, right), up])
-
-
-def _frame(place: Axes, title: str, reach: float) -> None:
-    place.set(title=title, xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
-    place.spines[:].set_color("#cccccc")
 
 
 def _once(place: Axes) -> tuple[list, list[str]]:

@@ -1,9 +1,10 @@
 """A capture from recordings to a dataset and its report, in steps that are kept."""
 
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.capture.dataset import write_dataset
@@ -46,6 +47,14 @@ class CaptureOptions:
                 raise InvalidInput(name, "1 or more", value)
 
 
+class Outcome(NamedTuple):
+    """What came of a capture."""
+
+    verdict: Verdict
+    notes: tuple[str, ...]
+    """What people should know of the recordings, each a sentence."""
+
+
 class CaptureJob:
     """The capture of some recordings into the folder `data`."""
 
@@ -66,8 +75,8 @@ class CaptureJob:
         require_disk(data, required_bytes(len(recordings) * options.frames, options.size))
         self.steps = Steps(STEPS, data / WORK, digest, force=force_step, watch=watch)
 
-    def run(self) -> Verdict:
-        """Do the steps that aren't done, and return the verdict. Without a scene there is no dataset, but a report.
+    def run(self) -> Outcome:
+        """Do the steps that aren't done. Without a scene there is no dataset, but a report.
 
         Raises `CaptureFailed` if a recording can't be read.
         """
@@ -82,7 +91,7 @@ class CaptureJob:
             self._write_dataset(frames, found)
         report = Report(frames, measures, verdict, self._images, found)
         self.steps.do("report", {}, lambda folder, progress: write_report(report, folder, progress))
-        return verdict
+        return Outcome(verdict, frames.notes)
 
     @property
     def _images(self) -> Path:
@@ -92,9 +101,10 @@ class CaptureJob:
         return {name: value for name, value in asdict(self.options).items() if name != "seed"}
 
     def _take_frames(self, folder: Path, progress: Progress) -> None:
-        offsets = self.options.offsets
+        offsets, notes = self.options.offsets, []
         if offsets is None and len(self.recordings) > 1:
-            offsets = find_offsets(self.recordings).seconds
+            found = find_offsets(self.recordings)
+            offsets, notes = found.seconds, [found.note]
         frames = extract_frames(
             self.recordings,
             folder / IMAGES,
@@ -103,7 +113,14 @@ class CaptureJob:
             offsets=offsets,
             progress=lambda done, total: progress("reading", done, total),
         )
-        frames.save(folder / FRAMES)
+        notes = tuple(self._without_names(note) for note in (*notes, *frames.notes))
+        replace(frames, notes=notes).save(folder / FRAMES)
+
+    def _without_names(self, note: str) -> str:
+        """A sentence with numbers for the recordings' names, which may tell when and with what they were made."""
+        for number, recording in enumerate(self.recordings, start=1):
+            note = re.sub(rf"(?<!\w){re.escape(recording.name)}(?!\w)", f"recording {number}", note, count=1)
+        return note
 
     def _keep(self, name: str, run: Callable[[Path, Progress], None]) -> Path:
         self.steps.do(name, {"seed": self.options.seed}, run)

@@ -8,8 +8,6 @@ import numpy as np
 
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.poses import Poses
-from msdgs_train.capture.rotation import beyond_rotation
-from msdgs_train.capture.sparse_model import Summary
 
 
 @dataclass(frozen=True)
@@ -49,11 +47,12 @@ class Measures:
     """By registered frame, in the order of names."""
     baseline: float = 0.0
     """Largest distance of two camera centers over the median depth of the points."""
+    seen: float = 0.0
+    """Points that a registered frame sees, median."""
+    size: int = 1
+    """Longer side of the frames in pixels."""
     beyond_rotation: float = 0.0
-    """Pixels by which points move in the widest pairs of a moving camera's frames, beyond what a rotation explains; the
-    largest over the cameras."""
-    rotation_only: float = 0.0
-    """Share of matched pairs of frames that a rotation explains."""
+    """Pixels of the motion between frames of one camera that no rotation explains."""
     moving: float = 0.0
     """Mean share of a frame that moves."""
     cut_apart: tuple[float, ...] = ()
@@ -67,6 +66,7 @@ def measure_frames(frames: FrameSet) -> Measures:
         cameras=len(frames.cameras),
         frames=len(frames.frames),
         available=sum(camera.available for camera in frames.cameras),
+        size=max((max(camera.width, camera.height) for camera in frames.cameras), default=1),
         seconds=max(times, default=0.0) - min(times, default=0.0),
         blurred=frames.blurred,
         cuts=frames.cuts,
@@ -85,7 +85,7 @@ def measure_poses(measures: Measures, frames: FrameSet, poses: Poses, moving: Ma
         points=len(model.points),
         other_models=model.others,
         method=model.method,
-        rotation_only=model.rotation_only,
+        beyond_rotation=model.beyond_rotation,
         moving=float(np.mean(list(moving.values()))) if moving else 0.0,
         cut_apart=_cut_apart(frames, set(poses.registered)),
     )
@@ -98,20 +98,8 @@ def measure_poses(measures: Measures, frames: FrameSet, poses: Poses, moving: Ma
         parallax=float(np.median(parallax)),
         parallax_of_frames=tuple(float(angle) for angle in parallax),
         baseline=_extent(model.centers) / float(np.median(model.depths())),
-        beyond_rotation=max(
-            (beyond_rotation(model, rows) for rows in _moving_cameras(frames, poses, model)), default=0
-        ),
+        seen=float(np.median(np.bincount(model.observations[:, 0], minlength=len(model.names)))),
     )
-
-
-def _moving_cameras(frames: FrameSet, poses: Poses, model: Summary) -> list[np.ndarray]:
-    """Rows in the model of the frames of each moving camera, in the order of time."""
-    rows = {str(name): row for row, name in enumerate(model.names)}
-    return [
-        np.array([rows[frame.name] for frame in frames.frames if frame.camera == camera and frame.name in rows], int)
-        for camera in range(len(frames.cameras))
-        if not poses.fixed[camera]
-    ]
 
 
 def _cut_apart(frames: FrameSet, registered: set[str]) -> tuple[float, ...]:

@@ -27,12 +27,11 @@ def digest_of(recordings: Sequence[Path]) -> str:
     """A digest of the contents of video files and of folders of images, and of their order; not of paths."""
     digest = hashlib.sha256(__version__.encode())
     for recording in recordings:
-        files = sorted(recording.iterdir()) if recording.is_dir() else [recording]
+        files = sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
         digest.update(f"{len(files)}\n".encode())
         for file in files:
-            if file.is_file():
-                with file.open("rb") as opened:
-                    digest.update(hashlib.file_digest(opened, "sha256").digest())
+            with file.open("rb") as opened:
+                digest.update(hashlib.file_digest(opened, "sha256").digest())
     return digest.hexdigest()
 
 

@@ -62,7 +62,8 @@ def write_report(report: Report, folder: Path, progress: Progress) -> None:
     drawings = {"path": "", "parallax": ""}
     if report.model is not None:
         cameras = {frame.name: frame.camera for frame in report.frames.frames}
-        drawings["path"] = draw_path(report.model, np.array([cameras[str(name)] for name in report.model.names]))
+        of_images = np.array([cameras[str(name)] for name in report.model.names])
+        drawings["path"] = f"<div class=pair>{''.join(draw_path(report.model, of_images))}</div>"
         drawings["parallax"] = draw_parallax(report.frames, parallax)
     page = Template(PAGE.read_text(encoding="utf-8")).substitute(
         level=report.verdict.level.replace(" ", "-"),
@@ -70,6 +71,7 @@ def write_report(report: Report, folder: Path, progress: Progress) -> None:
         figures="".join(_row(name, value) for name, value in figures(report.measures)),
         path=_section("Cameras and points", drawings["path"]),
         parallax=_section("Parallax a frame", drawings["parallax"]),
+        notes="".join(f"<p>{escape(note)}</p>" for note in report.frames.notes),
         sheet="".join(_sheet(report, progress)),
     )
     write_text(folder / "capture.html", page)
@@ -88,7 +90,7 @@ def figures(measures: Measures) -> Iterator[tuple[str, str]]:
     yield "intervals left out as blurred", f"{measures.blurred}"
     yield "black frames", f"{measures.black:.0%}"
     yield "cuts", ", ".join(f"{cut:.1f} s" for cut in measures.cuts) or "none"
-    yield "points", f"{measures.points:,}"
+    yield "points", f"{measures.points:,}; {measures.seen:.0f} in a frame"
     yield "mapper", measures.method or "none"
     yield "frames of other models", ", ".join(map(str, measures.other_models)) or "none"
 
@@ -115,7 +117,7 @@ def _plain(report: Report, parallax: Mapping[str, float]) -> dict[str, Any]:
         for frame in report.frames.frames
     ]
     verdict = {"level": report.verdict.level, "findings": [asdict(finding) for finding in report.verdict.findings]}
-    return {"verdict": verdict, **measures, "frames_taken": frames}
+    return {"verdict": verdict, "notes": report.frames.notes, **measures, "frames_taken": frames}
 
 
 def _verdict(verdict: Verdict) -> str:

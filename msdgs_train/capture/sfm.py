@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pycolmap
 
+from msdgs_train.capture.rotation import Pair, beyond_rotation
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, UndistortedJob
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 
@@ -28,10 +29,15 @@ MAX_EXTRA_PARAMETER = 0.5
 BACKGROUND_PEAK = 0.002
 """Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is
 but one view of each camera."""
+FOCALS = (0.3, 6.0)
+"""Focal lengths in long sides of the image: views of 118° to 10°."""
 MIN_MODEL = 3
 """Images of the smallest model."""
+MIN_MATCHES = 30
+"""Of a pair of images that tells whether the camera only turned."""
 ENOUGH = 0.95
-"""Part of the images in one model below which the global mapper is tried, too."""
+"""Part of the images in one model below which the global mapper is tried, too. With fixed cameras only it always is:
+the incremental one is often wrong where each camera has one view."""
 BATCH = 16
 """Images, or hundreds of pairs, between two reports of progress."""
 WARNINGS_ONLY = 2
@@ -73,7 +79,7 @@ def find(job: PosesJob) -> None:
     sparse.mkdir()
     largest.write(sparse)
     sizes = [model.num_reg_images() for model in models]
-    summary(largest, method, sizes[1:], _rotation_only(database)).save(workspace / GEOMETRY)
+    summary(largest, method, sizes[1:], _beyond_rotation(database)).save(workspace / GEOMETRY)
     database.unlink()
 
 
@@ -117,15 +123,15 @@ def match(job: PosesJob, database: Path) -> None:
 
 
 def mapped(job: PosesJob, database: Path, workspace: Path) -> tuple[list[pycolmap.Reconstruction], str]:
-    """The models, the largest first, of the incremental mapper, or of the global one if that makes a larger one."""
+    """The models, the largest first, of the incremental mapper or of the global one, whichever makes the larger one."""
     total = sum(len(camera.names) for camera in job.cameras)
     scratch = workspace / "models"
-    incremental = _incremental(job, database, scratch, total)
-    models, method = incremental, "incremental"
-    if total > 1 and (not incremental or incremental[0].num_reg_images() < ENOUGH * total):
+    models, method = _incremental(job, database, scratch, total), "incremental"
+    size = _size(models[0])[0] if models else 0
+    if total > 1 and (size < ENOUGH * total or all(camera.frames is not None for camera in job.cameras)):
         report("mapping again", 0, total)
         of_global = _global(job, database, scratch)
-        if of_global and (not incremental or of_global[0].num_reg_images() > incremental[0].num_reg_images()):
+        if of_global and (not models or _size(of_global[0]) > _size(models[0])):
             models, method = of_global, "global"
     shutil.rmtree(scratch, ignore_errors=True)
     report("mapping", total, total)
@@ -168,7 +174,24 @@ def _global(job: PosesJob, database: Path, scratch: Path) -> list[pycolmap.Recon
 
 
 def _sorted(models: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), model.compute_mean_reprojection_error()))
+    for model in models.values():
+        _drop_impossible(model)
+    return sorted(filter(pycolmap.Reconstruction.num_reg_images, models.values()), key=_size, reverse=True)
+
+
+def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    """Images and observations."""
+    return model.num_reg_images(), model.compute_num_observations()
+
+
+def _drop_impossible(model: pycolmap.Reconstruction) -> None:
+    """Take the poses of images whose camera no lens has: the mapper lets a single view of a camera end there."""
+    for image_id in list(model.reg_image_ids()):
+        image = model.image(image_id)
+        camera = model.camera(image.camera_id)
+        focal = camera.mean_focal_length() / max(camera.width, camera.height)
+        if not (FOCALS[0] < focal < FOCALS[1] and abs(camera.params[-1]) < MAX_EXTRA_PARAMETER):
+            model.deregister_frame(image.frame_id)
 
 
 def _color(model: pycolmap.Reconstruction, cameras: Sequence[CameraViews]) -> None:
@@ -191,7 +214,7 @@ def _spread_to_frames(model: pycolmap.Reconstruction, cameras: Sequence[CameraVi
             model.add_image_with_trivial_frame(copy, image.cam_from_world())
 
 
-def summary(model: pycolmap.Reconstruction, method: str, others: list[int], rotation_only: float) -> Summary:
+def summary(model: pycolmap.Reconstruction, method: str, others: list[int], beyond_rotation: float) -> Summary:
     """What `sparse_model` keeps of a model."""
     images = sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
     ids = sorted(model.points3D)
@@ -213,7 +236,7 @@ def summary(model: pycolmap.Reconstruction, method: str, others: list[int], rota
         error=model.compute_mean_reprojection_error() if points else 0.0,
         method=method,
         others=tuple(others),
-        rotation_only=rotation_only,
+        beyond_rotation=beyond_rotation,
     )
 
 
@@ -236,13 +259,25 @@ def write_undistorted(job: UndistortedJob) -> None:
     model.write(job.out)
 
 
-def _rotation_only(database: Path) -> float:
-    """Part of the verified pairs of images that a rotation of the camera alone explains."""
+def _beyond_rotation(database: Path) -> float:
+    """Displacement that no rotation of the camera explains, of matches of pairs of one camera's images, in pixels."""
     with pycolmap.Database.open(database) as opened:
-        kinds = [geometry.config for geometry in opened.read_two_view_geometries()[1]]
-    known = pycolmap.TwoViewGeometryConfiguration
-    verified = [kind for kind in kinds if kind not in (known.UNDEFINED, known.DEGENERATE)]
-    return sum(kind == known.PANORAMIC for kind in verified) / max(len(verified), 1)
+        images = {image.image_id: image for image in opened.read_all_images()}
+        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
+        pairs, long_side = [], 1
+        for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
+            one, other = pycolmap.pair_id_to_image_pair(key)
+            camera = cameras[images[one].camera_id]
+            if images[one].camera_id != images[other].camera_id or len(geometry.inlier_matches) < MIN_MATCHES:
+                continue
+            long_side = max(camera.width, camera.height)
+            middle = np.array([camera.width, camera.height]) / 2
+            places = [
+                (opened.read_keypoints(image)[rows, :2] - middle) / long_side
+                for image, rows in zip((one, other), geometry.inlier_matches.T, strict=True)
+            ]
+            pairs.append(Pair(*places))
+    return long_side * beyond_rotation(pairs)
 
 
 def _tolerance(database: Path) -> float:

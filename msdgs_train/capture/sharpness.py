@@ -2,7 +2,8 @@
 
 The variance of the Laplacian, the usual measure, takes noise for detail and is proportional to the square of contrast.
 Here the energy of gradients at a fine scale, in the direction in which it is least, as motion blurs in one, and less
-what the picture's noise contributes, is divided by the variance of the picture at a coarse scale. `python -m benchmarks.capture.sharpness` compares both against blurred copies.
+what the picture's noise contributes, is divided by the variance of the picture at a coarse scale.
+`python -m benchmarks.capture.sharpness` compares both against blurred copies.
 """
 
 from functools import cache
@@ -19,8 +20,6 @@ USABLE = (8, 247)
 
 def sharpness(grey: np.ndarray) -> float:
     """Return a number that is larger for a sharper picture of the same subject, from uint8 [H, W]."""
-    import cv2
-
     values = grey.astype(np.float32)
     energy = np.linalg.eigvalsh(_structure(values))[0]
     detail = max(float(energy) - noise_variance(values) * _noise_gain(), 0.0)

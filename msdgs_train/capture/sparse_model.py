@@ -25,7 +25,7 @@ class Summary:
     error: float  # mean reprojection error of the points in pixels
     method: str  # "incremental" or "global"
     others: tuple[int, ...]  # images of the other models
-    rotation_only: float  # part of the matched pairs of images that a rotation of the camera explains
+    beyond_rotation: float  # pixels of the motion between images that no rotation of the camera explains
 
     def save(self, file: Path) -> None:
         """Write it as NPZ."""
@@ -39,7 +39,7 @@ class Summary:
             arrays = {field.name: stored[field.name] for field in fields(Summary)}
         others = tuple(int(size) for size in arrays["others"])
         scalars = {"error": float(arrays["error"]), "method": str(arrays["method"]), "others": others}
-        return Summary(**{**arrays, **scalars, "rotation_only": float(arrays["rotation_only"])})
+        return Summary(**{**arrays, **scalars, "beyond_rotation": float(arrays["beyond_rotation"])})
 
     @property
     def centers(self) -> np.ndarray:

@@ -16,11 +16,11 @@ MAX_BLACK = 0.5
 """Share of the frames that are black."""
 MIN_REGISTERED, FEW_REGISTERED = 0.5, 0.95
 """Shares of frames with poses."""
-MIN_BEYOND_ROTATION = 2.0
-"""In units of the reprojection error; a pixel at least."""
-MAX_ROTATION_ONLY = 0.5
-"""Share of pairs of frames that a rotation explains, where there are no poses."""
-MIN_PARALLAX, LITTLE_PARALLAX = 1.5, 8.0
+MIN_BEYOND_ROTATION = 1 / 1000
+"""In longer sides of the frames; half a pixel at least, as matches are no better."""
+MIN_SEEN = 15
+"""Points that a frame sees, for poses that are more than guesses."""
+MIN_PARALLAX, LITTLE_PARALLAX = 1.0, 4.0
 """Degrees."""
 MUCH_BLURRED = 0.2
 """Share of the intervals."""
@@ -30,6 +30,8 @@ LARGE_ERROR = 1.5
 """Pixels."""
 
 MOVE = "walk around the subject, so that the camera itself moves sideways, by 20° or more as the subject sees it"
+
+TEXTURE = "move slower, in more light, and keep surfaces with texture that stand still in view"
 
 
 @dataclass(frozen=True)
@@ -102,22 +104,13 @@ def _of_frames(measures: Measures) -> Iterator[Finding]:
 def _without_parallax(measures: Measures) -> Iterator[Finding]:
     if measures.cameras == measures.fixed == 1:
         yield Finding("the camera stands still, and one fixed camera can't give a scene", MOVE, prevents=True)
-    elif measures.fixed < measures.cameras and _only_turned(measures):
-        yield Finding(f"the camera only turns, on the spot{_unexplained(measures)}", MOVE, prevents=True)
+    elif measures.fixed == 0 and measures.beyond_rotation > 0 and _only_turned(measures):
+        turned = f"all but {measures.beyond_rotation:.1f} pixels of the motion in its pictures is a rotation"
+        yield Finding(f"the camera only turns on the spot: {turned}", MOVE, prevents=True)
 
 
 def _only_turned(measures: Measures) -> bool:
-    if measures.fixed:
-        return False  # the fixed cameras see the scene from other places
-    if not measures.registered:
-        return measures.rotation_only > MAX_ROTATION_ONLY
-    return measures.beyond_rotation < max(MIN_BEYOND_ROTATION * measures.reprojection_error, 1.0)
-
-
-def _unexplained(measures: Measures) -> str:
-    if not measures.registered:
-        return f" (a rotation explains {measures.rotation_only:.0%} of the pairs of frames)"
-    return f" (no rotation explains {measures.beyond_rotation:.1f} pixels of the motion in its pictures)"
+    return measures.beyond_rotation < max(MIN_BEYOND_ROTATION * measures.size, 0.5)
 
 
 def _without_poses(measures: Measures) -> Iterator[Finding]:
@@ -133,8 +126,9 @@ def _without_poses(measures: Measures) -> Iterator[Finding]:
         yield Finding(f"{measures.moving:.0%} of the image moves", "keep more of what stands still in view", True)
     elif share < MIN_REGISTERED:
         found = f"poses are found for {measures.registered} of {measures.frames} frames"
-        remedy = "move slower, in more light, and keep surfaces with texture that stand still in view"
-        yield Finding(found, remedy, prevents=True)
+        yield Finding(found, TEXTURE, prevents=True)
+    elif measures.seen < MIN_SEEN:
+        yield Finding(f"a frame sees {measures.seen:.0f} points that poses agree on, which is too few", TEXTURE, True)
     elif measures.parallax < MIN_PARALLAX:
         yield Finding(f"the parallax of {measures.parallax:.1f}° is too little", MOVE, prevents=True)
 

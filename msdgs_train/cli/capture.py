@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,6 +15,8 @@ from msdgs_train.cli.console import console, progress_bar
 from msdgs_train.settings import optional
 
 RECORDINGS_AND_DATA = tyro.conf.arg(metavar="IN... DATA", help_behavior_hint="(one or more, then one)")
+PACKAGES = ("av", "cv2", "pycolmap", "scipy")
+"""Of the extra `capture`."""
 Step = Literal["frames", "poses", "masks", "dataset", "report"]
 
 
@@ -59,10 +62,10 @@ class Capture:
         if not self.paths or bool(recordings) == bool(self.times_from):
             expected = "DATA alone with --times-from" if self.times_from else "one recording or more, then DATA"
             raise InvalidInput("IN... DATA", expected, " ".join(map(str, self.paths)) or "nothing")
-        try:
-            return self._times(data) if self.times_from else self._capture(recordings, data)
-        except ModuleNotFoundError as error:
-            raise CaptureNotInstalled(f"capture needs {error.name}: pip install 'msdgs[capture]'") from None
+        for package in PACKAGES:
+            if find_spec(package) is None:
+                raise CaptureNotInstalled(f"msdgs-train capture needs {package}: pip install 'msdgs[capture]'")
+        return self._times(data) if self.times_from else self._capture(recordings, data)
 
     def _times(self, data: Path) -> int:
         from msdgs_train.capture.times_from import times_from
@@ -82,7 +85,9 @@ class Capture:
         job = CaptureJob(
             recordings, data, options, threads=self.threads, force_step=self.force_step, watch=watched_step
         )
-        verdict = job.run()
+        verdict, notes = job.run()
+        for note in notes:
+            console.print(note, soft_wrap=True, highlight=False)
         console.print(verdict.text, soft_wrap=True, highlight=False)
         console.print(f"wrote {data / 'capture.html'}, with pictures of the recording", soft_wrap=True)
         if verdict.level == "no scene":

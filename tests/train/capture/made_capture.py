@@ -46,7 +46,7 @@ def made_model(frames: FrameSet, camera_to_world: list[np.ndarray] | None = None
         error=0.4,
         method="incremental",
         others=(5, 3),
-        rotation_only=0.0,
+        beyond_rotation=7.5,
     )
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from msdgs_train.capture.measures import measure_frames, measure_poses
-from msdgs_train.capture.rotation import Pair, rotation_residual
-from tests.support.camera_moves import DISTANCE, arc, pan
-from tests.train.capture.made_capture import FOCAL, made_frames, made_model, made_poses
+from msdgs_train.capture.rotation import Pair, beyond_rotation
+from msdgs_train.capture.verdict import MIN_BEYOND_ROTATION
+from tests.support.camera_moves import DISTANCE, TARGET, arc, pan
+from tests.train.capture.made_capture import made_frames, made_model, made_poses
 
 
 def test_frames_are_counted():
@@ -24,36 +25,35 @@ def test_an_arc_is_measured():
     assert measures.baseline == pytest.approx(chord / DISTANCE, rel=0.1)
     assert measures.parallax == pytest.approx(30, abs=8)
     assert len(measures.parallax_of_frames) == 16
-    assert measures.beyond_rotation > 5
+    assert (measures.beyond_rotation, measures.seen, measures.size) == (7.5, 200, 96)
 
 
-@pytest.mark.parametrize("degrees", [20, 60])
-def test_nothing_of_a_pan_is_beyond_a_rotation(degrees: float):
-    frames = made_frames()
-    poses = made_poses(made_model(frames, pan(degrees, 16)))
-    assert measure_poses(measure_frames(frames), frames, poses, {}).beyond_rotation < 0.01
-
-
-@pytest.mark.parametrize("scale", [0.8, 1.25])
-def test_a_pan_with_a_wrong_focal_length_and_moved_centers_is_still_one(scale: float):
-    """As COLMAP finds it: depths that make up for centers that never moved."""
-    random, frames = np.random.default_rng(0), made_frames()
-    model = made_model(frames, pan(40, 16))
-    pair_points = random.uniform(-30, 30, (100, 2))
-    rays = np.concatenate([pair_points, np.full((100, 1), FOCAL)], axis=1)
-    turn = model.camera_to_world[8, :3, :3].T @ model.camera_to_world[0, :3, :3]
-    turned = rays @ turn.T
-    pair = Pair(pair_points, FOCAL * turned[:, :2] / turned[:, 2:], scale * FOCAL)
-    assert rotation_residual(pair, FOCAL) < 1e-6
-    assert rotation_residual(pair, scale * FOCAL) > 0.1
-
-
-def test_what_moves_does_not_hide_that_the_rest_only_turns():
+def pairs_of(camera_to_world: list[np.ndarray], focal: float, moving: int = 0) -> list[Pair]:
+    """Exact matches of 150 points of all depths between the first frame and each other one, of which some move."""
     random = np.random.default_rng(0)
-    first = random.uniform(-40, 40, (100, 2))
-    second = first.copy()
-    second[:20] += 15
-    assert rotation_residual(Pair(first, second, FOCAL), FOCAL) < 0.2
+    points = TARGET + random.uniform(-0.7, 0.7, (150, 3))
+    places = []
+    for index, pose in enumerate(camera_to_world):
+        local = (points + (np.arange(150) < moving)[:, None] * [0.02 * index, 0, 0] - pose[:3, 3]) @ pose[:3, :3]
+        places.append(focal * local[:, :2] / local[:, 2:])
+    return [Pair(places[0], place) for place in places[1:]]
+
+
+@pytest.mark.parametrize("focal", [0.6, 1.0, 2.2])
+@pytest.mark.parametrize("moving", [0, 30])
+def test_nothing_of_a_pan_is_beyond_a_rotation_whatever_the_lens(focal: float, moving: int):
+    assert beyond_rotation(pairs_of(pan(20, 9), focal, moving)) < MIN_BEYOND_ROTATION
+
+
+@pytest.mark.parametrize("moving", [0, 30])
+def test_an_arc_is_beyond_a_rotation_by_its_parallax(moving: int):
+    found = [beyond_rotation(pairs_of(arc(degrees, 9), 1.0, moving)) for degrees in (0.001, 5, 10, 20)]
+    assert found[1] > 0.005
+    assert found == sorted(found)
+
+
+def test_without_pairs_nothing_is_known():
+    assert beyond_rotation([]) == 0
 
 
 @pytest.mark.parametrize(
@@ -80,4 +80,3 @@ def test_two_captures_of_one_arc_measure_the_same_in_any_unit():
     one, other = (measure_poses(measure_frames(frames), frames, made_poses(each), {}) for each in (model, larger))
     assert other.parallax_of_frames == pytest.approx(one.parallax_of_frames)
     assert other.baseline == pytest.approx(one.baseline)
-    assert other.beyond_rotation == pytest.approx(one.beyond_rotation)

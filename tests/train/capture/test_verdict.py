@@ -23,6 +23,8 @@ GOOD = Measures(
     parallax_of_frames=(25.0,) * 200,
     baseline=0.6,
     beyond_rotation=20.0,
+    seen=300.0,
+    size=1024,
     moving=0.15,
 )
 
@@ -35,7 +37,8 @@ def test_a_good_recording_is_good():
 NO_SCENE = {
     "tripod": ({"fixed": 1, "registered": 0, "parallax": 0.0}, "stands still"),
     "pure pan with poses": ({"beyond_rotation": 0.7}, "only turns"),
-    "pure pan without poses": ({"registered": 0, "rotation_only": 0.9, "parallax": 0.0}, "only turns"),
+    "pure pan without poses": ({"registered": 0, "beyond_rotation": 0.7, "parallax": 0.0}, "only turns"),
+    "poses of a few points": ({"seen": 5.0}, "5 points"),
     "8 frames": ({"frames": 8, "available": 8, "registered": 8}, "8 frames, of 8"),
     "black": ({"black": 0.8, "registered": 0}, "80% of the frames are black"),
     "cut": ({"registered": 110, "cuts": (4.24,), "cut_apart": (4.24,)}, "cut at 4.2 s"),
@@ -58,7 +61,7 @@ IMPROVABLE = {
     "few frames": ({"frames": 30, "registered": 30}, "30 frames are few"),
     "blurred": ({"blurred": 100}, "100 of 300 intervals"),
     "some without poses": ({"registered": 150}, "150 of 200"),
-    "little parallax": ({"parallax": 4.0}, "4.0°"),
+    "little parallax": ({"parallax": 3.0}, "3.0°"),
     "large errors": ({"reprojection_error": 2.0}, "2.0 pixels"),
     "much that moves": ({"moving": 0.6}, "60%"),
 }
@@ -73,7 +76,7 @@ def test_what_could_be_better_is_said(changes: dict, words: str):
 
 
 def test_all_that_could_be_better_is_said():
-    verdict = judge(replace(GOOD, blurred=100, parallax=4.0))
+    verdict = judge(replace(GOOD, blurred=100, parallax=3.0))
     assert len(verdict.findings) == 2
     assert len(verdict.text.splitlines()) == 3
 
