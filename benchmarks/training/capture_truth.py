@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import tyro
@@ -15,12 +15,16 @@ from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.frames import extract_frames
-from msdgs_train.capture.masked_poses import Keep, Progress, find_masked_poses, step_names
+from msdgs_train.capture.masked_poses import Progress, find_masked_poses, step_names
+from msdgs_train.capture.offsets import find_offsets
 from msdgs_train.capture.poses import Poses, find_poses
 from tests.support.clips import Clip, fixed_camera_clips, moving_camera_clip
 
 OFFSETS = (0.0, 0.08, 0.16, 0.24, 0.32, 0.4)  # seconds
 COLUMNS = ("clip", "registered", "rotation °, median", "largest", "centers %, median", "largest", "reprojection px")
+
+
+Part = Literal["moving", "fixed"]
 
 
 class Errors(NamedTuple):
@@ -31,9 +35,10 @@ class Errors(NamedTuple):
 
 
 def main(
-    frames: int = 90,
-    width: int = 512,
-    rig_frames: int = 24,
+    parts: tuple[Part, ...] = ("moving", "fixed"),
+    frames: int = 72,
+    width: int = 448,
+    rig_frames: int = 16,
     threads: int = 1,
     seed: int = 0,
     video: Path | None = None,
@@ -48,6 +53,7 @@ def main(
     cameras stand around the toys. Centers' errors are percentages of the diagonal of the box around the true centers.
 
     Args:
+        parts: Clips: a moving camera, six fixed ones.
         frames: Frames of the moving camera's clip.
         width: Pixels of the clips.
         rig_frames: Frames of each fixed camera.
@@ -61,12 +67,15 @@ def main(
         return self_test()
     made = table(f"{frames} frames of {width} px, seed {seed}, {threads} thread(s)", *COLUMNS)
     with scratch_folder() as folder:
-        clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=60.0, seed=seed)
-        share = f"{clip.moving.mean():.0%} moves"
-        for name, found, taken in _with_and_without(clip.file, folder / "clip", seed, threads):
-            made.add_row(f"moving camera, {share}, {name}", *_row(found, taken, clip.camera_to_world, clip.times))
-        rig = fixed_camera_clips(folder, width=width, frames=rig_frames, offsets=OFFSETS, seed=seed)
-        made.add_row("six fixed cameras", *rig_row(rig, folder / "rig", seed, threads))
+        if "moving" in parts:
+            clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=60.0, seed=seed)
+            share = f"{clip.moving.mean():.0%} moves"
+            for name, found, taken in _with_and_without(clip.file, folder / "clip", seed, threads):
+                made.add_row(f"moving camera, {share}, {name}", *_row(found, taken, clip.camera_to_world, clip.times))
+        if "fixed" in parts:
+            rig = fixed_camera_clips(folder, width=width, frames=rig_frames, offsets=OFFSETS, seed=seed)
+            off, cells = rig_row(rig, folder / "rig", seed, threads)
+            made.add_row(f"six fixed cameras, offsets within {off:.2f} frames", *cells)
         if video is not None and poses is not None:
             given = read_poses(poses)
             for name, found, taken in _with_and_without(video, folder / "video", seed, threads):
@@ -78,30 +87,27 @@ def main(
 def _with_and_without(video: Path, folder: Path, seed: int, threads: int) -> list[tuple[str, Poses, FrameSet]]:
     images = folder / "images"
     taken = extract_frames([video], images)
-    masked = find_masked_poses(images, taken, _run_in(folder), seed=seed, threads=threads)
+
+    def keep(name: str, run: Callable[[Path, Progress], None]) -> Path:
+        run(folder / name, _progress)
+        return folder / name
+
+    masked = find_masked_poses(images, taken, keep, seed=seed, threads=threads)
     first = Poses.load(folder / step_names()[0], taken)
     return [("without masks", first, taken), (f"masks, {masked.passes} passes", masked.poses, taken)]
 
 
-def _run_in(folder: Path) -> Keep:
-    """Runs each step, in a folder of its name."""
-
-    def keep(name: str, run: Callable[[Path, Progress], None]) -> Path:
-        (folder / name).mkdir(parents=True)
-        run(folder / name, _progress)
-        return folder / name
-
-    return keep
-
-
-def rig_row(rig: list[Clip], folder: Path, seed: int, threads: int) -> list[str]:
-    """The row of fixed cameras, one pose each."""
-    images = folder / "images"
-    taken = extract_frames([clip.file for clip in rig], images, offsets=[clip.offset for clip in rig])
+def rig_row(rig: list[Clip], folder: Path, seed: int, threads: int) -> tuple[float, list[str]]:
+    """The largest error of the starts in frames, and the cells of fixed cameras, one pose each."""
+    images, files = folder / "images", [clip.file for clip in rig]
+    heard = find_offsets(files).seconds
+    frame = rig[0].times[1] - rig[0].times[0]
+    off = float(np.abs(np.array(heard) - [clip.offset for clip in rig]).max() / frame)
+    taken = extract_frames(files, images, offsets=heard)
     found = find_poses(images, taken, folder, seed=seed, threads=threads, progress=_progress)
     cameras = {frame.name: frame.camera for frame in taken.frames}
     rows = [cameras[name] for name in found.registered]
-    return _cells(found, len(taken.frames), np.array([rig[row].camera_to_world[0] for row in rows]))
+    return off, _cells(found, len(taken.frames), np.array([rig[row].camera_to_world[0] for row in rows]))
 
 
 def _row(found: Poses, taken: FrameSet, truth: np.ndarray, times: np.ndarray | None) -> list[str]:

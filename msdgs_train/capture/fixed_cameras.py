@@ -11,8 +11,8 @@ from msdgs_train.capture.image_files import read_color, read_gray
 CORNERS, CORNER_QUALITY, CORNER_DISTANCE = 300, 0.02, 7
 STILL = 0.002
 """Part of the width by which a corner of the background may move: one pixel of 500."""
-MOST = 0.5
-"""Part of the corners that are at rest when the camera is."""
+ENOUGH = 0.3
+"""Part of the corners that are at rest when the camera is; the others are on what moves."""
 COMPARED = 8
 """Frames that the first one is compared with."""
 BACKGROUND = 40
@@ -20,7 +20,7 @@ BACKGROUND = 40
 
 
 def is_fixed(files: Sequence[Path]) -> bool:
-    """Whether most corners of the first image stay where they are in the others, which are in the order of time."""
+    """Whether enough corners of the first image stay where they are in the others, which are in the order of time."""
     if len(files) < 2:
         return False
     first = read_gray(files[0])
@@ -28,7 +28,7 @@ def is_fixed(files: Sequence[Path]) -> bool:
     if corners is None:
         return False
     still = [_still_part(first, read_gray(file), corners) for file in spread(files[1:], COMPARED)]
-    return float(np.median(still)) > MOST
+    return float(np.median(still)) > ENOUGH
 
 
 def background(files: Sequence[Path]) -> np.ndarray:

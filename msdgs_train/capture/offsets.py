@@ -108,15 +108,16 @@ def _delay(one: Sound, two: Sound) -> tuple[float, float]:
     """Seconds by which the video `two` starts after `one`, and the confidence."""
     from scipy import fft
 
-    length = fft.next_fast_len(len(one.samples) + len(two.samples), real=True)
-    cross = fft.rfft(one.samples, length) * np.conj(fft.rfft(two.samples, length))
-    frequency = fft.rfftfreq(length, 1 / RATE)
+    length = 1 << (len(one.samples) + len(two.samples) - 1).bit_length()
+    spectra = [np.asarray(fft.rfft(sound.samples, length)) for sound in (one, two)]
+    cross = spectra[0] * spectra[1].conj()
+    frequency = np.fft.rfftfreq(length, 1 / RATE)
     cross[(frequency < BAND[0]) | (frequency > BAND[1])] = 0
     strength = np.abs(cross)
     phases = np.divide(cross, strength, out=np.zeros_like(cross), where=strength > 0)
-    energy = np.square(fft.irfft(phases, length))
+    energy = np.square(np.asarray(fft.irfft(phases, length)))
     smoothing = np.exp(-0.5 * (2 * np.pi * frequency * WIDTH) ** 2)
-    power = np.maximum(fft.irfft(fft.rfft(energy) * smoothing, length), 0)
+    power = np.maximum(np.asarray(fft.irfft(np.asarray(fft.rfft(energy)) * smoothing, length)), 0)
     peak = int(power.argmax())
     lag = peak - length if peak >= len(one.samples) else peak
     away = np.roll(power, -peak)[int(APART * RATE) : -int(APART * RATE)]

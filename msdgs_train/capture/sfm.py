@@ -26,6 +26,9 @@ T = TypeVar("T")
 CAMERA_MODEL = "SIMPLE_RADIAL"
 MAX_EXTRA_PARAMETER = 0.5
 """Of the distortion; models with more are wrong ones of few images."""
+BACKGROUND_PEAK = 0.002
+"""Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is but
+one view of each camera."""
 MIN_MODEL = 3
 """Images of the smallest model."""
 MIN_MATCHES = 30
@@ -80,9 +83,11 @@ def find(job: PosesJob) -> None:
 def extract(job: PosesJob, database: Path) -> None:
     """Write the cameras and SIFT features of all views."""
     total, done = sum(len(camera.names) for camera in job.cameras), 0
-    options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
     for camera in job.cameras:
+        options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         reader = pycolmap.ImageReaderOptions(camera_model=CAMERA_MODEL)
+        if camera.frames is not None:
+            options.sift.peak_threshold = BACKGROUND_PEAK
         if job.masks is not None and camera.frames is None:
             reader.mask_path = Path(job.masks)
         for names in _batches(camera.names, BATCH):
@@ -98,6 +103,7 @@ def extract(job: PosesJob, database: Path) -> None:
 def match(job: PosesJob, database: Path) -> None:
     """Match the pairs and write their two-view geometries."""
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
+    options.guided_matching = all(camera.frames is not None for camera in job.cameras)
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = job.seed
     geometry.ransac.max_error = _tolerance(database)

@@ -7,6 +7,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.codec.context import Flags
 from av.video.reformatter import Interpolation
 
 WIDTH, HEIGHT = 96, 64
@@ -45,9 +46,10 @@ def write_clip(
     metadata: dict[str, str] | None = None,
     sound: np.ndarray | None = None,
     interlaced: bool = False,
-    **colors: int,
+    colors: dict[str, int] | None = None,
 ) -> Path:
     """Write a video; `times` in seconds, `turn` in degrees, `sound` [N] in -1 to 1 at 16 kHz."""
+    colors = colors or {}
     times = [index / rate for index in range(len(images))] if times is None else times
     with av.open(str(path), "w", options=muxer or {}) as container:
         container.metadata.update(metadata or {})
@@ -58,7 +60,7 @@ def write_clip(
         for name, value in colors.items():
             setattr(stream.codec_context, name, value)
         if interlaced:
-            stream.codec_context.flags |= av.codec.context.Flags.interlaced_dct
+            stream.codec_context.flags |= Flags.interlaced_dct
         if turn:
             stream.set_display_rotation(turn)
         audio: Any = None if sound is None else container.add_stream("aac", rate=16000, layout="mono")

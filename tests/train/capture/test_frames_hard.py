@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from av.stream import Disposition
 
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.frame_set import FrameSet
@@ -141,7 +142,7 @@ def test_hdr_is_said(tmp_path: Path):
         pixels="yuv420p10le",
         codec="libx265",
         options={"x265-params": "log-level=none"},
-        **colors,
+        colors=colors,
     )
     assert "a.mp4 is HDR (HLG)" in extract_frames([clip], tmp_path / "out").notes[0]
 
@@ -164,7 +165,7 @@ def test_a_cover_is_not_the_video(tmp_path: Path):
     with av.open(str(clip), "w") as container:
         cover: Any = container.add_stream("mjpeg", rate=1)
         cover.width, cover.height, cover.pix_fmt = 640, 640, "yuvj420p"
-        cover.disposition = av.stream.Disposition.attached_pic
+        cover.disposition = Disposition.attached_pic
         stream: Any = container.add_stream("libx264", rate=30)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
         container.mux(cover.encode(av.VideoFrame.from_ndarray(picture(0, 640, 640), format="rgb24")))

@@ -61,6 +61,7 @@ def test_starts_are_those_of_the_pictures(tmp_path: Path):
 
 
 def test_unrelated_sounds_and_silence_give_equal_starts_and_it_is_said(tmp_path: Path):
+    videos: list[Path] = []
     for seed in range(4):
         videos = [write(tmp_path, f"{k}.mp4", heard(event(5, seed=10 * seed + k), k)) for k in range(2)]
         found = find_offsets(videos)

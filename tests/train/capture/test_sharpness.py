@@ -1,6 +1,7 @@
 """Sharpness ranks a picture above its blurred copies, whatever the exposure and noise of either."""
 
 import weakref
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
@@ -84,7 +85,7 @@ def test_few_pictures_are_in_memory_at_a_time(tmp_path: Path):
     alive: list[weakref.ref[np.ndarray]] = []
     most = 0
 
-    def made() -> object:
+    def made() -> Iterator[Picture]:
         nonlocal most
         for index in range(60):
             grey = picture(index)[..., 0].copy()
@@ -93,6 +94,6 @@ def test_few_pictures_are_in_memory_at_a_time(tmp_path: Path):
             yield Picture(index, index / 30, grey, lambda shown=grey: shown)
             del grey
 
-    selection = select(made(), 0.0, Intervals(0.0, 0.5), lambda chosen: f"{chosen.index}", lambda: None)  # type: ignore[arg-type]
+    selection = select(made(), 0.0, Intervals(0.0, 0.5), lambda chosen: f"{chosen.index}", lambda: None)
     assert len(selection.taken) == 4
     assert most <= 3

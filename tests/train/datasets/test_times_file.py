@@ -8,7 +8,7 @@ import pytest
 
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from msdgs_train.datasets.common.times_file import TIMES_FILE, write_times
-from tests.train.datasets.layouts import nerfstudio_json, write_nerfstudio
+from tests.train.datasets.layouts import COLMAP_NAMES, nerfstudio_json, write_colmap, write_nerfstudio
 
 NAMES = [f"images/f_{index:02}.png" for index in range(3)]
 TIMES = dict(zip(NAMES, [0.5, 0.0, 0.75], strict=True))
@@ -64,4 +64,25 @@ def test_names_may_be_spelled_as_on_other_systems(folder: Path, name: str):
 def test_a_file_that_gives_no_times_is_refused(folder: Path, content: Any, problem: str):
     (folder / TIMES_FILE).write_text(json.dumps(content))
     with pytest.raises(DatasetInvalid, match=rf"{TIMES_FILE}: {problem}"):
+        load_scene(folder)
+
+
+def test_a_colmap_scene_has_the_times_of_the_file(tmp_path: Path):
+    folder = write_colmap(tmp_path)
+    times = dict(zip((f"images/{name}" for name in sorted(COLMAP_NAMES)), (7.0, 3.0, 5.0), strict=False))
+    write_times(folder, times)
+    scene = load_scene(folder)
+    read = {
+        frame.image_path.relative_to(folder).as_posix(): frame.t for part in scene.splits.values() for frame in part
+    }
+    first, last = min(times.values()), max(times.values())
+    assert read == {name: (time - first) / (last - first) for name, time in times.items()}
+    assert sorted(times_of(folder, time_from="none")) == [0.0] * len(times)
+
+
+def test_an_image_of_a_colmap_scene_without_a_time_is_named(tmp_path: Path):
+    folder = write_colmap(tmp_path)
+    first, *others = sorted(COLMAP_NAMES)
+    write_times(folder, {f"images/{name}": 1.0 for name in others})
+    with pytest.raises(DatasetInvalid, match=rf"images/{first}`.* is missing"):
         load_scene(folder)
