@@ -16,6 +16,8 @@ MAX_BLACK = 0.5
 """Share of the frames that are black."""
 MIN_REGISTERED, FEW_REGISTERED = 0.5, 0.95
 """Shares of frames with poses."""
+MIN_WHOLE = 0.75
+"""The same, where poses break off."""
 MIN_BEYOND_ROTATION = 1 / 1000
 """In longer sides of the frames; half a pixel at least, as matches are no better."""
 MIN_SEEN = 15
@@ -115,13 +117,10 @@ def _only_turned(measures: Measures) -> bool:
 
 def _without_poses(measures: Measures) -> Iterator[Finding]:
     share = measures.registered / measures.frames
-    if share < FEW_REGISTERED and measures.cut_apart:
-        seconds = ", ".join(f"{cut:.1f}" for cut in measures.cut_apart)
-        yield Finding(
-            f"the recording is cut at {seconds} s, and poses join only one side",
-            "split it there, and take one part",
-            True,
-        )
+    if share < MIN_WHOLE and measures.breaks:
+        seconds = ", ".join(f"{second:.1f}" for second in measures.breaks)
+        found = f"poses break off at {seconds} s, as at a cut, and join only one side"
+        yield Finding(found, "split the recording there, and take one part, or record in one take", prevents=True)
     elif share < MIN_REGISTERED and measures.moving > MUCH_MOVING:
         yield Finding(f"{measures.moving:.0%} of the image moves", "keep more of what stands still in view", True)
     elif share < MIN_REGISTERED:
