@@ -1,6 +1,7 @@
 """Figures of frames and poses agree with how they were made."""
 
 from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
