@@ -27,8 +27,8 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 MAX_EXTRA_PARAMETER = 0.5
 """Of the distortion; models with more are wrong ones of few images."""
 BACKGROUND_PEAK = 0.002
-"""Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is but
-one view of each camera."""
+"""Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is
+but one view of each camera."""
 MIN_MODEL = 3
 """Images of the smallest model."""
 MIN_MATCHES = 30

@@ -80,7 +80,9 @@ def test_all_figures_are_shown_and_in_the_json(reported: Path):
 def test_masks_are_drawn_over_the_pictures(reported: Path):
     text = (reported / "capture.html").read_text(encoding="utf-8")
     coded = re.findall(r"data:image/jpeg;base64,([^\"]+)", text)
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(coded[0]), np.uint8), cv2.IMREAD_COLOR).astype(float)
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(coded[0]), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    image = image.astype(float)
     redness = image[..., 2] - image[..., :2].mean(axis=2)
     assert redness[:, :40].mean() > 60 > 20 > abs(redness[:, 56:].mean())
 
