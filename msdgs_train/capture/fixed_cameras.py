@@ -44,6 +44,6 @@ def spread(files: Sequence[Path], count: int) -> list[Path]:
 
 
 def _still_part(first: np.ndarray, other: np.ndarray, corners: np.ndarray) -> float:
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, other, corners, None)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, other, corners, corners.copy())
     lengths = np.linalg.norm((moved - corners).reshape(-1, 2), axis=1)
     return float(np.mean((lengths < STILL * first.shape[1]) & (found.ravel() == 1)))

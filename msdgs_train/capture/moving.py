@@ -116,15 +116,18 @@ def _reduced(gray: np.ndarray) -> np.ndarray:
 
 def _pair(one: _Shot, other: _Shot, lens: Lens | None, flow: cv2.DISOpticalFlow) -> tuple[np.ndarray, np.ndarray]:
     """[H, W] distances of both frames' pixels to epipolar lines in units of the noise; NaN where the flow is unsure."""
-    there, back = flow.calc(one.gray, other.gray, None), flow.calc(other.gray, one.gray, None)
+    there, back = (
+        flow.calc(first, second, np.zeros((*first.shape, 2), np.float32))
+        for first, second in ((one.gray, other.gray), (other.gray, one.gray))
+    )
     sure = _returns(there, back)
-    known = one.camera_to_world is not None and other.camera_to_world is not None
+    poses = one.camera_to_world, other.camera_to_world
     best, explained = None, 0.0
     for each in filter(None, (lens, Lens.unknown(one.gray.shape))):
         starts, ends, returns = each.undistorted(), each.undistorted(there), each.undistorted(back)
         geometries = [(robust_fundamental(starts[sure], ends[sure], each), FIT_SHARE)]
-        if known and each is lens:
-            geometries.append((fundamental_of_poses(one.camera_to_world, other.camera_to_world, each), 1.0))
+        if poses[0] is not None and poses[1] is not None and each is lens:
+            geometries.append((fundamental_of_poses(poses[0], poses[1], each), 1.0))
         for geometry, weight in geometries:
             if geometry is None:
                 continue
@@ -133,7 +136,8 @@ def _pair(one: _Shot, other: _Shot, lens: Lens | None, flow: cv2.DISOpticalFlow)
             if share > explained:
                 best, explained = (forward, line_distances(geometry.T, starts, returns)), share
     if best is None:
-        return (np.full(one.gray.shape, np.nan),) * 2
+        nothing = np.full(one.gray.shape, np.nan)
+        return nothing, nothing
     noise = max(1.48 * float(np.median(best[0][sure])), NOISE)
     return np.where(sure, best[0] / noise, np.nan), np.where(_returns(back, there), best[1] / noise, np.nan)
 
@@ -177,7 +181,7 @@ def _components(mask: np.ndarray, keep: Callable[[np.ndarray, np.ndarray], np.nd
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     kept = np.zeros(count, np.uint8)
     kept[1:] = keep(labels, stats[:, cv2.CC_STAT_AREA])[1:]
-    return kept[labels]
+    return np.take(kept, np.asarray(labels, np.intp))
 
 
 def _most_per_label(score: np.ndarray, labels: np.ndarray, count: int) -> np.ndarray:

@@ -204,7 +204,7 @@ def summary(model: pycolmap.Reconstruction, method: str, others: list[int], beyo
     for index, image in enumerate(images):
         poses[index, :3] = image.cam_from_world().inverse().matrix()
         seen += [(index, rows[point.point3D_id]) for point in image.get_observation_points2D()]
-    cameras = [image.camera for image in images]
+    cameras = [model.camera(image.camera_id) for image in images]
     points = [model.point3D(point_id) for point_id in ids]
     return Summary(
         names=np.array([image.name for image in images], dtype=str),
@@ -233,7 +233,7 @@ def write_undistorted(job: UndistortedJob) -> None:
                 point.xy = pinhole.img_from_cam(np.append(local, 1.0))
     for key, pinhole in pinholes.items():
         camera = model.camera(key)
-        camera.model, camera.params = pinhole.model, pinhole.params
+        camera.model, camera.params = pinhole.model, list(pinhole.params)
         camera.width, camera.height = pinhole.width, pinhole.height
     Path(job.out).mkdir(parents=True, exist_ok=True)
     model.write(job.out)

@@ -160,19 +160,18 @@ class _Textures:
         self.scale = TEXELS * 0.5 * width / math.tan(0.5 * FIELD_OF_VIEW)
         sizes = ROOM[1] - ROOM[0]
         self.faces = [
-            [_collage(*np.delete(sizes, axis) * self.scale, random, contrast=0.9) for _ in range(2)]
-            for axis in range(3)
+            [_collage(np.delete(sizes, axis) * self.scale, random, contrast=0.9) for _ in range(2)] for axis in range(3)
         ]
-        self.poster = _collage(*np.array(POSTER_SIZE) * self.scale, random, contrast=0.4)
+        self.poster = _collage(np.array(POSTER_SIZE) * self.scale, random, contrast=0.4)
 
 
-def _collage(width: float, height: float, random: np.random.Generator, contrast: float) -> np.ndarray:
-    """[height, width, 3] float32 in [0, 1]: rectangles of many sizes and grain."""
-    shape = (math.ceil(height) + 1, math.ceil(width) + 1)
+def _collage(size: np.ndarray, random: np.random.Generator, contrast: float) -> np.ndarray:
+    """[H, W, 3] float32 in [0, 1] that covers `size`, [2], width and height: rectangles of many sizes and grain."""
+    shape = (math.ceil(size[1]) + 1, math.ceil(size[0]) + 1)
     image = np.full((*shape, 3), 0.5, np.float32)
-    for size in np.geomspace(0.3 * min(shape), 4, 500):
+    for side in np.geomspace(0.3 * min(shape), 4, 500):
         x, y = random.uniform(0, shape[1]), random.uniform(0, shape[0])
-        w, h = size * random.uniform(0.4, 1.6, 2)
+        w, h = side * random.uniform(0.4, 1.6, 2)
         box = np.array(cv2.boxPoints(((x, y), (w, h), random.uniform(0, 90))), np.int32)
         color = 0.5 + contrast * random.uniform(-0.5, 0.5, 3)
         cv2.fillConvexPoly(image, box, color.tolist(), cv2.LINE_AA)
