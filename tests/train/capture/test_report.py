@@ -99,6 +99,17 @@ def test_names_are_escaped(tmp_path: Path):
     assert 'alt="&lt;b&gt;&amp;.png"' in text
 
 
+def test_poses_without_points_are_reported(tmp_path: Path):
+    frames = made_frames()
+    write_images(frames, tmp_path / "images", tmp_path / "masks")
+    poses = made_poses(made_model(frames, points=0))
+    measures = measure_poses(measure_frames(frames), frames, poses, {})
+    found = MaskedPoses(poses, tmp_path / "masks", {}, 0)
+    write_report(Report(frames, measures, judge(measures), tmp_path / "images", found), tmp_path, lambda *_: None)
+    assert judge(measures).level == "no scene"
+    assert "<svg" not in (tmp_path / "capture.html").read_text(encoding="utf-8")
+
+
 @pytest.fixture(scope="module")
 def browser():
     with chromium() as browser:
