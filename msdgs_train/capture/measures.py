@@ -94,15 +94,28 @@ def measure_poses(measures: Measures, frames: FrameSet, poses: Poses, moving: Ma
     )
     if not len(model.observations):
         return measures
-    parallax = np.nan_to_num(model.parallax())
+    seen, parallax = _of_frames(frames, poses)
     return replace(
         measures,
         reprojection_error=model.error,
         parallax=float(np.median(parallax)),
         parallax_of_frames=tuple(float(angle) for angle in parallax),
         baseline=_extent(model.centers) / float(np.median(model.depths())),
-        seen=float(np.median(np.bincount(model.observations[:, 0], minlength=len(model.names)))),
+        seen=float(np.median(seen)),
     )
+
+
+def _of_frames(frames: FrameSet, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """[N] points that each registered frame sees, and its parallax in degrees. All frames of a fixed camera have those
+    of its background, which is the only one that was matched."""
+    model, of_name = poses.summary, {frame.name: frame.camera for frame in frames.frames}
+    cameras = np.array([of_name[str(name)] for name in model.names])
+    seen, parallax = np.bincount(model.observations[:, 0], minlength=len(cameras)), np.nan_to_num(model.parallax())
+    for camera in np.unique(cameras):
+        if poses.fixed[camera]:
+            own = cameras == camera
+            seen[own], parallax[own] = seen[own].max(), parallax[own].max()
+    return seen, parallax
 
 
 def _breaks(frames: FrameSet, registered: set[str]) -> tuple[float, ...]:

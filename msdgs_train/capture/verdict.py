@@ -35,6 +35,8 @@ MOVE = "walk around the subject, so that the camera itself moves sideways, by 20
 
 TEXTURE = "move slower, in more light, and keep surfaces with texture that stand still in view"
 
+CLOSER = "place the cameras closer to each other, so that neighbours see the same surfaces with texture"
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -125,7 +127,7 @@ def _without_poses(measures: Measures) -> Iterator[Finding]:
         yield Finding(f"{measures.moving:.0%} of the image moves", "keep more of what stands still in view", True)
     elif share < MIN_REGISTERED:
         found = f"poses are found for {measures.registered} of {measures.frames} frames"
-        yield Finding(found, TEXTURE, prevents=True)
+        yield Finding(found, CLOSER if measures.fixed else TEXTURE, prevents=True)
     elif measures.seen < MIN_SEEN:
         yield Finding(f"a frame sees {measures.seen:.0f} points that poses agree on, which is too few", TEXTURE, True)
     elif measures.parallax < MIN_PARALLAX:
@@ -135,7 +137,7 @@ def _without_poses(measures: Measures) -> Iterator[Finding]:
 def _improvable(measures: Measures) -> Iterator[Finding]:
     if measures.registered < FEW_REGISTERED * measures.frames:
         found = f"poses are found for {measures.registered} of {measures.frames} frames; the others are left out"
-        yield Finding(found, "move slower, and keep surfaces with texture that stand still in view", False)
+        yield Finding(found, CLOSER if measures.fixed else TEXTURE, prevents=False)
     if measures.parallax < LITTLE_PARALLAX:
         yield Finding(f"the parallax of {measures.parallax:.1f}° is little", MOVE, prevents=False)
     if measures.reprojection_error > LARGE_ERROR:

@@ -87,5 +87,10 @@ def test_several_fixed_cameras_need_no_motion(changes: dict):
     assert judge(replace(GOOD, **changes)).level == "good"
 
 
+def test_fixed_cameras_without_poses_are_to_be_closer():
+    (finding,) = judge(replace(GOOD, cameras=6, fixed=6, registered=150)).findings
+    assert "closer" in finding.remedy
+
+
 def test_a_cut_that_poses_bridge_is_none():
     assert judge(replace(GOOD, cuts=(4.2,))).level == "good"
