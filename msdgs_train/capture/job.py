@@ -68,18 +68,19 @@ class CaptureJob:
         force_step: str | None = None,
         watch: Watch,
     ) -> None:
-        """Raises `InvalidInput` if `data` holds anything else, `CaptureFailed` if its disk lacks space."""
+        """Raises `InvalidInput` if `data` holds anything else, `CaptureFailed` if a recording can't be read."""
         self.recordings, self.data, self.options, self.threads = recordings, data, options, threads
+        self.required_bytes = required_bytes(recordings, options.frames, options.size)
         digest = digest_of(recordings)
         claim(data, digest)
-        require_disk(data, required_bytes(len(recordings) * options.frames, options.size))
         self.steps = Steps(STEPS, data / WORK, digest, force=force_step, watch=watch)
 
     def run(self) -> Outcome:
         """Do the steps that aren't done. Without a scene there is no dataset, but a report.
 
-        Raises `CaptureFailed` if a recording can't be read.
+        Raises `CaptureFailed` if the disk lacks space, or a recording can't be read.
         """
+        require_disk(self.data, self.required_bytes)
         self.steps.do("frames", self._without_seed(), self._take_frames)
         frames = FrameSet.load(self.steps.path("frames") / FRAMES)
         measures, found = measure_frames(frames), None

@@ -70,10 +70,10 @@ def find_masked_poses(
         if not _is_better(again, poses):
             break
         passes += 1
-        gain = 1 - again.summary.error / poses.summary.error
         registers_more = len(again.registered) > len(poses.registered)
+        gains = again.summary.error < (1 - GAIN) * poses.summary.error
         poses = again
-        if not registers_more and gain < GAIN:
+        if not (registers_more or gains):
             break
         masks, moving = mask(passes, poses)
     return MaskedPoses(poses, masks, moving, passes)

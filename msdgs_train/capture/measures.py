@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.poses import Poses
+
+STRETCH = 0.1
+"""Share of a camera's frames, from which on a run of frames with poses, or without, is no accident."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,8 @@ class Measures:
     """Pixels of the motion between frames of one camera that no rotation explains."""
     moving: float = 0.0
     """Mean share of a frame that moves."""
-    cut_apart: tuple[float, ...] = ()
-    """Cuts of which only one side has poses, in seconds."""
+    breaks: tuple[float, ...] = ()
+    """Seconds at which a stretch of frames with poses borders on one without, as at a cut."""
 
 
 def measure_frames(frames: FrameSet) -> Measures:
@@ -87,30 +90,42 @@ def measure_poses(measures: Measures, frames: FrameSet, poses: Poses, moving: Ma
         method=model.method,
         beyond_rotation=model.beyond_rotation,
         moving=float(np.mean(list(moving.values()))) if moving else 0.0,
-        cut_apart=_cut_apart(frames, set(poses.registered)),
+        breaks=_breaks(frames, set(poses.registered)),
     )
     if not len(model.observations):
         return measures
-    parallax = np.nan_to_num(model.parallax())
+    seen, parallax = _of_frames(frames, poses)
     return replace(
         measures,
         reprojection_error=model.error,
         parallax=float(np.median(parallax)),
         parallax_of_frames=tuple(float(angle) for angle in parallax),
         baseline=_extent(model.centers) / float(np.median(model.depths())),
-        seen=float(np.median(np.bincount(model.observations[:, 0], minlength=len(model.names)))),
+        seen=float(np.median(seen)),
     )
 
 
-def _cut_apart(frames: FrameSet, registered: set[str]) -> tuple[float, ...]:
-    """The cuts on one side of which, up to the next cut, fewer than half of the frames have a pose."""
-    edges = [-np.inf, *frames.cuts, np.inf]
-    has_poses = []
-    for start, end in pairwise(edges):
-        part = [frame.name in registered for frame in frames.frames if start <= frame.time < end]
-        has_poses.append(not part or float(np.mean(part)) >= 0.5)
-    sides = zip(frames.cuts, pairwise(has_poses), strict=True)
-    return tuple(cut for cut, both in sides if not all(both))
+def _of_frames(frames: FrameSet, poses: Poses) -> tuple[np.ndarray, np.ndarray]:
+    """[N] points that each registered frame sees, and its parallax in degrees. All frames of a fixed camera have those
+    of its background, which is the only one that was matched."""
+    model, of_name = poses.summary, {frame.name: frame.camera for frame in frames.frames}
+    cameras = np.array([of_name[str(name)] for name in model.names])
+    seen, parallax = np.bincount(model.observations[:, 0], minlength=len(cameras)), np.nan_to_num(model.parallax())
+    for camera in np.unique(cameras):
+        if poses.fixed[camera]:
+            own = cameras == camera
+            seen[own], parallax[own] = seen[own].max(), parallax[own].max()
+    return seen, parallax
+
+
+def _breaks(frames: FrameSet, registered: set[str]) -> tuple[float, ...]:
+    found = []
+    for camera in range(len(frames.cameras)):
+        own = [(frame.time, frame.name in registered) for frame in frames.frames if frame.camera == camera]
+        stretches = [list(run) for _, run in groupby(own, key=lambda each: each[1])]
+        long = [run for run in stretches if len(run) >= max(3, STRETCH * len(own))]
+        found += [after[0][0] for before, after in pairwise(long) if before[0][1] != after[0][1]]
+    return tuple(found)
 
 
 def _extent(centers: np.ndarray) -> float:

@@ -10,6 +10,7 @@ from msdgs_serve import __version__
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import write_text
 from msdgs_train.capture.errors import CaptureFailed
+from msdgs_train.capture.frames import open_source
 
 WORK = "capture"
 """Folder of the steps' results in the dataset's folder."""
@@ -19,8 +20,6 @@ BYTES_PER_PIXEL = 4.0
 """Frames and images of the dataset as PNG, of 1.5 to 2 bytes a pixel each, and masks."""
 BYTES_PER_FRAME = 2_000_000
 """COLMAP's database: descriptors of 8,192 features, and matches."""
-LONGEST_ASPECT = 0.75
-"""Shorter over longer side of the frames that take most space."""
 
 
 def digest_of(recordings: Sequence[Path]) -> str:
@@ -51,9 +50,14 @@ def claim(data: Path, digest: str) -> None:
     write_text(mark, json.dumps({"digest": digest}) + "\n")
 
 
-def required_bytes(frames: int, size: int) -> int:
-    """Bytes of disk that a capture takes at most while it runs, about; `size` is the longer side in pixels."""
-    return round(frames * (size * size * LONGEST_ASPECT * BYTES_PER_PIXEL + BYTES_PER_FRAME))
+def required_bytes(recordings: Sequence[Path], frames: int, size: int) -> int:
+    """Bytes of disk that a capture takes at most while it runs, about; `size` is the longer side in pixels.
+
+    Raises `CaptureFailed` for a recording that can't be read.
+    """
+    sources = [open_source(recording, size) for recording in recordings]
+    of_frames = [each.width * each.height * BYTES_PER_PIXEL + BYTES_PER_FRAME for each in sources]
+    return round(sum(min(frames, each.count) * of_frame for each, of_frame in zip(sources, of_frames, strict=True)))
 
 
 def require_disk(data: Path, needed: int) -> None:

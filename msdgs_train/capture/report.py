@@ -51,8 +51,8 @@ class Report:
 
     @property
     def model(self) -> Summary | None:
-        """The poses, if there are any."""
-        return self.found.poses.summary if self.found and self.found.poses.registered else None
+        """The poses and points, if there are any points: COLMAP may leave poses without one."""
+        return self.found.poses.summary if self.found and len(self.found.poses.summary.observations) else None
 
 
 def write_report(report: Report, folder: Path, progress: Progress) -> None:

@@ -16,6 +16,8 @@ MAX_BLACK = 0.5
 """Share of the frames that are black."""
 MIN_REGISTERED, FEW_REGISTERED = 0.5, 0.95
 """Shares of frames with poses."""
+MIN_WHOLE = 0.75
+"""The same, where poses break off."""
 MIN_BEYOND_ROTATION = 1 / 1000
 """In longer sides of the frames; half a pixel at least, as matches are no better."""
 MIN_SEEN = 15
@@ -32,6 +34,8 @@ LARGE_ERROR = 1.5
 MOVE = "walk around the subject, so that the camera itself moves sideways, by 20° or more as the subject sees it"
 
 TEXTURE = "move slower, in more light, and keep surfaces with texture that stand still in view"
+
+CLOSER = "place the cameras closer to each other, so that neighbours see the same surfaces with texture"
 
 
 @dataclass(frozen=True)
@@ -115,18 +119,15 @@ def _only_turned(measures: Measures) -> bool:
 
 def _without_poses(measures: Measures) -> Iterator[Finding]:
     share = measures.registered / measures.frames
-    if share < FEW_REGISTERED and measures.cut_apart:
-        seconds = ", ".join(f"{cut:.1f}" for cut in measures.cut_apart)
-        yield Finding(
-            f"the recording is cut at {seconds} s, and poses join only one side",
-            "split it there, and take one part",
-            True,
-        )
+    if share < MIN_WHOLE and measures.breaks:
+        seconds = ", ".join(f"{second:.1f}" for second in measures.breaks)
+        found = f"poses break off at {seconds} s, as at a cut, and join only one side"
+        yield Finding(found, "split the recording there, and take one part, or record in one take", prevents=True)
     elif share < MIN_REGISTERED and measures.moving > MUCH_MOVING:
         yield Finding(f"{measures.moving:.0%} of the image moves", "keep more of what stands still in view", True)
     elif share < MIN_REGISTERED:
         found = f"poses are found for {measures.registered} of {measures.frames} frames"
-        yield Finding(found, TEXTURE, prevents=True)
+        yield Finding(found, CLOSER if measures.fixed else TEXTURE, prevents=True)
     elif measures.seen < MIN_SEEN:
         yield Finding(f"a frame sees {measures.seen:.0f} points that poses agree on, which is too few", TEXTURE, True)
     elif measures.parallax < MIN_PARALLAX:
@@ -136,7 +137,7 @@ def _without_poses(measures: Measures) -> Iterator[Finding]:
 def _improvable(measures: Measures) -> Iterator[Finding]:
     if measures.registered < FEW_REGISTERED * measures.frames:
         found = f"poses are found for {measures.registered} of {measures.frames} frames; the others are left out"
-        yield Finding(found, "move slower, and keep surfaces with texture that stand still in view", False)
+        yield Finding(found, CLOSER if measures.fixed else TEXTURE, prevents=False)
     if measures.parallax < LITTLE_PARALLAX:
         yield Finding(f"the parallax of {measures.parallax:.1f}° is little", MOVE, prevents=False)
     if measures.reprojection_error > LARGE_ERROR:

@@ -77,14 +77,13 @@ class Capture:
 
     def _capture(self, recordings: list[Path], data: Path) -> int:
         from msdgs_train.capture.job import CaptureJob, CaptureOptions
-        from msdgs_train.capture.recordings import gigabytes, required_bytes
+        from msdgs_train.capture.recordings import gigabytes
 
         options = CaptureOptions(self.frames, self.size, self.offsets, self.seed)
-        needed = gigabytes(required_bytes(len(recordings) * self.frames, self.size))
-        console.print(f"takes up to {needed} of disk in {data}", soft_wrap=True)
         job = CaptureJob(
             recordings, data, options, threads=self.threads, force_step=self.force_step, watch=watched_step
         )
+        console.print(f"takes up to {gigabytes(job.required_bytes)} of disk in {data}", soft_wrap=True)
         verdict, notes = job.run()
         for note in notes:
             console.print(note, soft_wrap=True, highlight=False)

@@ -35,7 +35,7 @@ def made_model(frames: FrameSet, camera_to_world: list[np.ndarray] | None = None
     poses = np.stack(camera_to_world or arc(40, len(frames.frames)))
     random = np.random.default_rng(0)
     positions = TARGET + random.uniform(-0.7, 0.7, (points, 3))
-    seen = np.array([(image, point) for image in range(len(poses)) for point in range(points)])
+    seen = np.array([(image, point) for image in range(len(poses)) for point in range(points)], int).reshape(-1, 2)
     return Summary(
         names=np.array([frame.name for frame in frames.frames]),
         camera_to_world=poses,

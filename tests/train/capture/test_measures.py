@@ -1,9 +1,13 @@
 """Figures of frames and poses agree with how they were made."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from msdgs_train.capture.measures import measure_frames, measure_poses
+from msdgs_train.capture.poses import Poses
 from msdgs_train.capture.rotation import Pair, beyond_rotation
 from msdgs_train.capture.verdict import MIN_BEYOND_ROTATION
 from tests.support.camera_moves import DISTANCE, TARGET, arc, pan
@@ -57,18 +61,35 @@ def test_without_pairs_nothing_is_known():
 
 
 @pytest.mark.parametrize(
-    ("cuts", "without", "apart"),
-    [((0.8,), range(8, 16), (0.8,)), ((0.8,), [3, 9], ()), ((0.4, 1.0), range(4), (0.4,)), ((), range(8), ())],
+    ("without", "breaks"),
+    [
+        (range(8, 16), (0.8,)),
+        ([3, 9], ()),
+        (range(4), (0.4,)),
+        (range(5, 10), (0.5, 1.0)),
+        ([0, *range(8, 16)], (0.8,)),
+    ],
 )
-def test_cuts_with_poses_on_one_side_only(cuts: tuple[float, ...], without: list[int], apart: tuple[float, ...]):
-    frames = made_frames(cuts=cuts)
+def test_poses_break_off_where_long_stretches_meet(without: Sequence[int], breaks: tuple[float, ...]):
+    frames = made_frames()
     model = made_model(frames)
     kept = np.array([row for row in range(16) if row not in set(without)])
     rows = {int(old): new for new, old in enumerate(kept)}
     seen = np.array([(rows[image], point) for image, point in model.observations.tolist() if image in rows])
     fewer = {"names": model.names[kept], "camera_to_world": model.camera_to_world[kept]}
     model = type(model)(**{**vars(model), **fewer, "intrinsics": model.intrinsics[kept], "observations": seen})
-    assert measure_poses(measure_frames(frames), frames, made_poses(model), {}).cut_apart == apart
+    assert measure_poses(measure_frames(frames), frames, made_poses(model), {}).breaks == breaks
+
+
+def test_frames_of_a_fixed_camera_have_the_figures_of_its_background():
+    """COLMAP matches only the background, under the name of one of the frames."""
+    frames = made_frames()
+    model = made_model(frames)
+    only = type(model)(**{**vars(model), "observations": model.observations[model.observations[:, 0] == 5]})
+    fixed = measure_poses(measure_frames(frames), frames, Poses(Path("sparse"), only, (True,)), {})
+    moving = measure_poses(measure_frames(frames), frames, made_poses(only), {})
+    assert (fixed.seen, moving.seen) == (200, 0)
+    assert len(set(fixed.parallax_of_frames)) == 1
 
 
 def test_two_captures_of_one_arc_measure_the_same_in_any_unit():

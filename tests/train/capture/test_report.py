@@ -80,7 +80,9 @@ def test_all_figures_are_shown_and_in_the_json(reported: Path):
 def test_masks_are_drawn_over_the_pictures(reported: Path):
     text = (reported / "capture.html").read_text(encoding="utf-8")
     coded = re.findall(r"data:image/jpeg;base64,([^\"]+)", text)
-    image = cv2.imdecode(np.frombuffer(base64.b64decode(coded[0]), np.uint8), cv2.IMREAD_COLOR).astype(float)
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(coded[0]), np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    image = image.astype(float)
     redness = image[..., 2] - image[..., :2].mean(axis=2)
     assert redness[:, :40].mean() > 60 > 20 > abs(redness[:, 56:].mean())
 
@@ -95,6 +97,17 @@ def test_names_are_escaped(tmp_path: Path):
     text = (tmp_path / "capture.html").read_text(encoding="utf-8")
     assert "<b>" not in text
     assert 'alt="&lt;b&gt;&amp;.png"' in text
+
+
+def test_poses_without_points_are_reported(tmp_path: Path):
+    frames = made_frames()
+    write_images(frames, tmp_path / "images", tmp_path / "masks")
+    poses = made_poses(made_model(frames, points=0))
+    measures = measure_poses(measure_frames(frames), frames, poses, {})
+    found = MaskedPoses(poses, tmp_path / "masks", {}, 0)
+    write_report(Report(frames, measures, judge(measures), tmp_path / "images", found), tmp_path, lambda *_: None)
+    assert judge(measures).level == "no scene"
+    assert "<svg" not in (tmp_path / "capture.html").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ NO_SCENE = {
     "poses of a few points": ({"seen": 5.0}, "5 points"),
     "8 frames": ({"frames": 8, "available": 8, "registered": 8}, "8 frames, of 8"),
     "black": ({"black": 0.8, "registered": 0}, "80% of the frames are black"),
-    "cut": ({"registered": 110, "cuts": (4.24,), "cut_apart": (4.24,)}, "cut at 4.2 s"),
+    "cut": ({"registered": 110, "breaks": (4.24,)}, "break off at 4.2 s"),
     "nothing but what moves": ({"registered": 20, "moving": 0.7}, "70% of the image moves"),
     "no texture": ({"registered": 0, "parallax": 0.0}, "0 of 200 frames"),
     "hardly any parallax": ({"parallax": 0.4}, "0.4°"),
@@ -85,6 +85,11 @@ def test_all_that_could_be_better_is_said():
                                      {"cameras": 3, "fixed": 2, "beyond_rotation": 0.0}])  # fmt: skip
 def test_several_fixed_cameras_need_no_motion(changes: dict):
     assert judge(replace(GOOD, **changes)).level == "good"
+
+
+def test_fixed_cameras_without_poses_are_to_be_closer():
+    (finding,) = judge(replace(GOOD, cameras=6, fixed=6, registered=150)).findings
+    assert "closer" in finding.remedy
 
 
 def test_a_cut_that_poses_bridge_is_none():
