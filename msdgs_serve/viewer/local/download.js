@@ -10,7 +10,7 @@ const GZIP = [0x1f, 0x8b];
  * @returns {Promise<Uint8Array>}
  */
 export async function download(source, what, progress) {
-  if (typeof source !== "string") return unpacked(new Uint8Array(await new Response(source).arrayBuffer()));
+  if (typeof source !== "string") return unpacked(new Uint8Array(await new Response(source).arrayBuffer()), what);
   const response = await fetch(source).catch(() => {
     throw new Error(`${what} can’t be loaded: the server doesn’t answer.`);
   });
@@ -28,11 +28,16 @@ export async function download(source, what, progress) {
   const bytes = await contents.catch(() => {
     throw new Error(`${what} can’t be loaded: the connection broke.`);
   });
-  return unpacked(new Uint8Array(bytes));
+  return unpacked(new Uint8Array(bytes), what);
 }
 
-async function unpacked(bytes) {
+async function unpacked(bytes, what) {
   if (bytes[0] !== GZIP[0] || bytes[1] !== GZIP[1]) return bytes;
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Uint8Array(await new Response(stream).arrayBuffer());
+  const contents = new Response(stream).arrayBuffer();
+  return new Uint8Array(
+    await contents.catch(() => {
+      throw new Error(`${what} is damaged, or was not copied or sent as a whole.`);
+    }),
+  );
 }

@@ -17,8 +17,8 @@ export const CHANNELS = ["rgb", "alpha", "depth"];
  * @param {object} options
  * @param {HTMLCanvasElement} options.canvas  one without a context yet
  * @param {string | Blob | ArrayBuffer} options.scene  the scene file, or its address; it may be gzipped
- * @param {string} options.runtime  address of the folder with ort.wasm.min.mjs, ort-wasm-simd-threaded.mjs and
- *   ort-wasm-simd-threaded.wasm, which may be gzipped
+ * @param {{module: string, glue: string, binary: string}} options.runtime  addresses of onnxruntime-web's files
+ *   ort.wasm.min.mjs, ort-wasm-simd-threaded.mjs and ort-wasm-simd-threaded.wasm, the last of which may be gzipped
  * @param {(bytes: {loaded: number, total: number}) => void} [options.onProgress]  `total` is 0 if it is unknown
  * @param {(error: Error) => void} [options.onError]  errors after loading
  */
@@ -27,7 +27,8 @@ export async function openEngine({ canvas, scene, runtime, onProgress = () => {}
   const address = (path) => String(new URL(path, document.baseURI));
   try {
     const source = typeof scene === "string" ? address(scene) : scene;
-    const facts = await opened(poser, { scene: source, runtime: address(runtime) }, onProgress);
+    const files = Object.fromEntries(Object.entries(runtime).map(([part, path]) => [part, address(path)]));
+    const facts = await opened(poser, { scene: source, runtime: files }, onProgress);
     const constants = await answerOf(poser, { kind: "constants" });
     return new Engine(canvas, poser, facts, constants.arrays, onError);
   } catch (error) {

@@ -3,15 +3,13 @@
 import { download } from "./download.js";
 import { readSceneFile } from "./scene_file.js";
 
-const RUNTIME = "ort.wasm.min.mjs";
-const BINARY = "ort-wasm-simd-threaded.wasm";
 const POSED = ["means", "quats", "scales"];
 const APPEARANCE = ["opacities", "sh"];
 const CHUNK = 2048; // Gaussians per call of a graph that runs layers on Gaussians
 const TRIALS = 3;
 
 class Poser {
-  /** Load onnxruntime-web and a scene. `runtime` is the address of the folder with onnxruntime-web's files. */
+  /** Load onnxruntime-web and a scene. `runtime` has the addresses of onnxruntime-web's files. */
   static async open({ scene, runtime }) {
     const loaded = {};
     const tell = (part) => (bytes, total) => {
@@ -21,11 +19,13 @@ class Poser {
       self.postMessage({ kind: "progress", loaded: sum("bytes"), total: sums.every((x) => x.total) ? sum("total") : 0 });
     };
     const [ort, wasmBinary, bytes] = await Promise.all([
-      import(new URL(RUNTIME, runtime)),
-      download(String(new URL(BINARY, runtime)), "onnxruntime-web", tell("runtime")),
+      import(runtime.module).catch(() => {
+        throw new Error(`onnxruntime-web can’t be loaded: ${runtime.module} isn’t there.`);
+      }),
+      download(runtime.binary, "onnxruntime-web", tell("runtime")),
       download(scene, "The scene file", tell("scene")),
     ]);
-    Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary, wasmPaths: String(new URL(".", runtime)) });
+    Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary, wasmPaths: { mjs: runtime.glue } });
     const poser = new Poser(ort, readSceneFile(bytes));
     await poser.#start(bytes);
     return poser;
