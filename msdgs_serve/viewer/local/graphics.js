@@ -39,8 +39,6 @@ export class Graphics {
     const rows = Math.max(Math.ceil(scene.gaussians / (1 << ROW_BITS)), 1);
     this.splats = target(gl, [gl.RGBA32UI, gl.RGBA32UI], 1 << ROW_BITS, rows);
     this.quads = quadIndices(gl, BATCH);
-    // 8 bits lose faint splats
-    this.format = gl.getExtension("EXT_color_buffer_float") ? gl.RGBA16F : gl.RGBA8;
     this.frame = null;
   }
 
@@ -69,7 +67,7 @@ export class Graphics {
     this.#project(view, this.poses[first.slot], this.poses[second.slot], share, channel);
     if (this.frame?.width !== width || this.frame?.height !== height) {
       this.frame?.remove();
-      this.frame = target(gl, [this.format], width, height);
+      this.frame = target(gl, [gl.RGB10_A2], width, height);
     }
     this.#blend(channel === "rgb" ? this.scene.metadata.background : [0, 0, 0]);
     gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
