@@ -29,6 +29,10 @@ export class Poses {
     this.kept = this.interpolates ? [...earlier, pose] : [pose];
   }
 
+  failed() {
+    this.isAsking = false;
+  }
+
   /**
    * Return what is shown at a time, { first, second, share, isExact }: two poses, the share of the way between them, and
    * whether that is the pose at `t`; null if there is none yet. `now` is in seconds. While time goes on the poses ahead

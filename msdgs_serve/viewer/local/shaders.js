@@ -12,9 +12,13 @@ export const MOVING = ["means", "quats", "scales"];
 /** Samplers of `projectShader` in the order of their texture units; of poses the earlier and the later one. */
 export const samplersOf = (posed) => ["order", ...STILL, ...posed.flatMap((name) => [`${name}A`, `${name}B`])];
 
+export const NEAR_PLANE = 0.01; // scene units
+
+/** The color that is 1 in the frame: colors of splats, and so those behind others, may be above what is shown. */
+export const BRIGHTEST = "2.0";
+
 const ALPHA_MIN = "(1.0 / 255.0)";
 const ALPHA_MAX = "0.999";
-const NEAR_PLANE = "0.01";
 
 /** A triangle over all of a target. */
 export const EVERYWHERE = `#version 300 es
@@ -184,5 +188,14 @@ void main() {
   float square = dot(place, place);
   if (square > 1.0) discard;
   float alpha = min(exp2(mix(splat.a, LOG2_ALPHA_MIN, square)), ${ALPHA_MAX});
-  pixel = vec4(splat.rgb * alpha, alpha);
+  pixel = vec4(splat.rgb * (alpha / ${BRIGHTEST}), alpha);
 }`.replace("LOG2_ALPHA_MIN", -Math.log2(255));
+
+/** The frame, for the canvas. */
+export const RESOLVE = `#version 300 es
+precision highp float;
+uniform sampler2D frame;
+out vec4 pixel;
+void main() {
+  pixel = vec4(texelFetch(frame, ivec2(gl_FragCoord.xy), 0).rgb * ${BRIGHTEST}, 1.0);
+}`;
