@@ -298,7 +298,9 @@ def scene_of(folder: Path, file_format: str = "sequence") -> DeformationSession:
     return DeformationSession(output)
 
 
-@pytest.mark.parametrize("option", [{"max_mb": 5.0}, {"for_web": True}, {"plan": "network"}, {"quick": True}, {"keep": ("static",)}])
+@pytest.mark.parametrize(
+    "option", [{"max_mb": 5.0}, {"for_web": True}, {"plan": "network"}, {"quick": True}, {"keep": ("static",)}]
+)
 def test_options_of_trained_models_are_refused_for_splats(tmp_path: Path, option: dict[str, Any]):
     splats = write(tmp_path, "a.ply", ply_bytes(inria_columns(some_gaussians(20, 0))))
     (name,) = option
