@@ -92,7 +92,9 @@ def opened(browser: Browser, address: str, renderer: str, scene: Scene, size: tu
         yield Drawn(page)
 
 
-def around(session: DeformationSession, size: tuple[int, int], azimuth: float, elevation: float, nearer: float = 1.0):
+def around(
+    session: DeformationSession, size: tuple[int, int], azimuth: float, elevation: float, nearer: float = 1.0
+) -> Camera:
     """A camera that looks at the middle of a scene, in degrees; `nearer` multiplies its distance."""
     view = framing(session.scene.metadata)
     pose = orbit(view.target, nearer * view.distance, azimuth, elevation, view.up)
