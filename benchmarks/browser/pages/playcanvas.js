@@ -1,6 +1,7 @@
 import * as pc from "playcanvas";
 
-const SETTLING = 40; // animation frames in which it sorts
+const SETTLING = 5; // animation frames between which it sorts
+const PAUSE = 300; // milliseconds between them
 
 export async function make({ canvas, splats, background, width, height }) {
   const device = await pc.createGraphicsDevice(canvas, { deviceTypes: ["webgl2"], antialias: false });
@@ -26,6 +27,7 @@ export async function make({ canvas, splats, background, width, height }) {
     toneMapping: pc.TONEMAP_NONE,
   });
   app.root.addChild(eye);
+  app.scene.gsplat.minPixelSize = 0; // draw all
   app.start();
   const show = (camera) => {
     eye.camera.fov = 2 * pc.math.RAD_TO_DEG * Math.atan(height / 2 / camera.fy);
@@ -38,7 +40,7 @@ export async function make({ canvas, splats, background, width, height }) {
   const settled = async () => {
     for (let k = 0; k < SETTLING; k += 1) {
       app.renderNextFrame = true;
-      await new Promise((done) => app.once("frameend", done));
+      await new Promise((done) => app.once("frameend", () => setTimeout(done, PAUSE)));
     }
   };
   return { show, settled };

@@ -1,7 +1,8 @@
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 import * as THREE from "three";
 
-const SETTLING = 40; // animation frames in which it sorts
+const SETTLING = 5; // animation frames between which it sorts
+const PAUSE = 300; // milliseconds between them
 
 export async function make({ canvas, splats, background, eps2d, width, height }) {
   const renderer = new THREE.WebGLRenderer({ canvas, antialias: false });
@@ -26,7 +27,7 @@ export async function make({ canvas, splats, background, eps2d, width, height })
     requestAnimationFrame(draw);
   };
   const settled = async () => {
-    for (let k = 0; k < SETTLING; k += 1) await new Promise((done) => requestAnimationFrame(() => done(draw())));
+    for (let k = 0; k < SETTLING; k += 1) await new Promise((done) => requestAnimationFrame(() => setTimeout(done, PAUSE, draw())));
   };
   return { show, settled };
 }

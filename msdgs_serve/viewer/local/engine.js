@@ -1,15 +1,14 @@
 // Draws a scene file with WebGL2. One worker poses it by onnxruntime-web, another sorts; nothing runs while nothing
 // changes.
 
-import { Graphics } from "./graphics.js";
+import { CHANNELS, Graphics, contextOf } from "./graphics.js";
 import { inWorld, viewOf } from "./place.js";
 import { Poses } from "./poses.js";
+import { NEAR_PLANE } from "./shaders.js";
 
-const NEAR_PLANE = 0.01; // scene units
+export { CHANNELS };
+
 const STATIC = { first: { slot: 0 }, second: { slot: 0 }, share: 0, isExact: true };
-
-/** Channels that are drawn. */
-export const CHANNELS = ["rgb", "alpha", "depth"];
 
 /**
  * Load a scene, and return an `Engine` that draws it. Rejects with an Error whose message is for people if the scene, the
@@ -23,14 +22,15 @@ export const CHANNELS = ["rgb", "alpha", "depth"];
  * @param {(error: Error) => void} [options.onError]  errors after loading
  */
 export async function openEngine({ canvas, scene, runtime, onProgress = () => {}, onError = () => {} }) {
-  const poser = worker("pose_worker.js");
+  const gl = contextOf(canvas);
   const address = (path) => String(new URL(path, document.baseURI));
+  const source = typeof scene === "string" ? address(scene) : scene;
+  const files = Object.fromEntries(Object.entries(runtime).map(([part, path]) => [part, address(path)]));
+  const poser = worker("pose_worker.js");
   try {
-    const source = typeof scene === "string" ? address(scene) : scene;
-    const files = Object.fromEntries(Object.entries(runtime).map(([part, path]) => [part, address(path)]));
-    const facts = await opened(poser, { scene: source, runtime: files }, onProgress);
+    const facts = await answerOf(poser, { kind: "open", scene: source, runtime: files }, onProgress);
     const constants = await answerOf(poser, { kind: "constants" });
-    return new Engine(canvas, poser, facts, constants.arrays, onError);
+    return new Engine(gl, poser, facts, constants.arrays, onError);
   } catch (error) {
     poser.terminate();
     throw error;
@@ -38,10 +38,6 @@ export async function openEngine({ canvas, scene, runtime, onProgress = () => {}
 }
 
 const worker = (name) => new Worker(new URL(name, import.meta.url), { type: "module" });
-
-function opened(poser, { scene, runtime }, onProgress) {
-  return answerOf(poser, { kind: "open", scene, runtime }, onProgress);
-}
 
 /** Send a message to the worker that poses, and return its answer. */
 function answerOf(poser, message, onProgress = () => {}) {
@@ -59,7 +55,7 @@ function answerOf(poser, message, onProgress = () => {}) {
 class Engine {
   #canvas;
   #poser;
-  #sorter = worker("sort_worker.js");
+  #sorter;
   #graphics;
   #poses;
   #onError;
@@ -68,11 +64,11 @@ class Engine {
   #sorting = null; // the view whose order is being computed, as a text
   #spent = null; // a buffer of an earlier order
   #sorted = ""; // the view that the order is for
-  #isReady = false; // whether the graphics have all arrays
+  #isReady = true; // whether the graphics have what doesn't depend on time
   #waiting = []; // of `settled`
 
-  constructor(canvas, poser, { metadata, moving, changing, steps }, constants, onError) {
-    this.#canvas = canvas;
+  constructor(gl, poser, { metadata, moving, changing, steps }, constants, onError) {
+    this.#canvas = gl.canvas;
     this.#poser = poser;
     this.#onError = onError;
     this.metadata = inWorld(metadata);
@@ -81,16 +77,19 @@ class Engine {
     this.steps = steps; // number of layers that can be applied one by one; 0 if none
     this.stats = { poseMs: 0, sortMs: 0, drawMs: 0 };
     const scene = { metadata: this.metadata, moving, gaussians: this.gaussians, changing };
-    this.#graphics = new Graphics(canvas, scene);
+    this.#graphics = new Graphics(gl, scene);
+    this.#graphics.setConstants(constants);
+    this.#sorter = worker("sort_worker.js");
     const interpolates = !metadata.plan.startsWith("frames:"); // whose Gaussians are replaced, not moved
     this.#poses = new Poses({ interpolates, range: metadata.time_range }, (pose) => this.#pose(pose));
-    this.#poser.onmessage = ({ data }) => this.#posed(data);
+    this.#poser.onmessage = ({ data }) => this.#takeAnswer(data);
     this.#poser.onerror = ({ message }) => onError(new Error(message));
     this.#sorter.onmessage = ({ data }) => this.#takeOrder(data);
     this.#sorter.onerror = ({ message }) => onError(new Error(message));
-    canvas.addEventListener("webglcontextlost", this.#lost);
-    canvas.addEventListener("webglcontextrestored", this.#restored);
-    this.#setConstants(constants);
+    this.#canvas.addEventListener("webglcontextlost", this.#lost);
+    this.#canvas.addEventListener("webglcontextrestored", this.#restored);
+    const { means } = constants;
+    this.#sorter.postMessage({ kind: "constants", means, moving }, [means.buffer]);
   }
 
   /**
@@ -167,15 +166,18 @@ class Engine {
     this.#poser.postMessage({ kind: "pose", t, steps: steps ?? undefined, slot });
   }
 
-  #posed(data) {
-    if (data.kind === "failed") this.#onError(new Error(data.message));
-    else if (data.kind === "constants") this.#setConstants(data.arrays);
-    else this.#takePose(data);
+  #takeAnswer(data) {
+    if (data.kind === "pose") this.#takePose(data);
+    else if (data.kind === "constants") this.#takeConstants(data);
+    else {
+      this.#poses.failed();
+      this.#onError(new Error(data.message));
+    }
   }
 
-  #setConstants(arrays) {
+  /** What was asked for after a lost context. */
+  #takeConstants({ arrays }) {
     this.#graphics.setConstants(arrays);
-    this.#sorter.postMessage({ kind: "constants", means: arrays.means, moving: this.moving }, [arrays.means.buffer]);
     this.#isReady = true;
     this.#schedule();
   }

@@ -1,21 +1,30 @@
 // The WebGL2 resources of a scene, and one frame of it.
 
 import {
-  BATCH, BLEND_FRAGMENT, BLEND_VERTEX, EVERYWHERE, MOVING, ROW_BITS, STILL, projectShader, samplersOf,
+  BATCH, BLEND_FRAGMENT, BLEND_VERTEX, BRIGHTEST, EVERYWHERE, MOVING, RESOLVE, ROW_BITS, STILL, projectShader,
+  samplersOf,
 } from "./shaders.js"; // prettier-ignore
 import { Texels, program, quadIndices, target } from "./webgl.js";
 
-const CHANNELS = ["rgb", "alpha", "depth"];
+/** Channels that are drawn. */
+export const CHANNELS = ["rgb", "alpha", "depth"];
+
 const SLOTS = 3; // poses: two that are shown, and the next
 const CONTEXT = { alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance" };
 
+/** The WebGL2 context of a canvas that has none yet. Throws an Error for people if there is none. */
+export function contextOf(canvas) {
+  const gl = canvas.getContext("webgl2", CONTEXT);
+  if (!gl) throw new Error("This browser doesn’t draw with WebGL2, or it is switched off.");
+  return gl;
+}
+
 export class Graphics {
-  /** `scene` has metadata, moving, gaussians, changing. Throws an Error without WebGL2. */
-  constructor(canvas, scene) {
-    this.canvas = canvas;
+  /** `scene` has metadata, moving, gaussians, and changing: those of opacities and SH that depend on time. */
+  constructor(gl, scene) {
+    this.gl = gl;
+    this.canvas = gl.canvas;
     this.scene = scene;
-    this.gl = canvas.getContext("webgl2", CONTEXT);
-    if (!this.gl) throw new Error("This browser doesn’t draw with WebGL2, or it is switched off.");
     this.restore();
   }
 
@@ -30,6 +39,7 @@ export class Graphics {
     this.found = 0; // Gaussians that are drawn
     this.project = program(gl, EVERYWHERE, projectShader({ degree: scene.metadata.sh_degree, posed }));
     this.blend = program(gl, BLEND_VERTEX, BLEND_FRAGMENT);
+    this.resolve = program(gl, EVERYWHERE, RESOLVE);
     const textures = (names) => Object.fromEntries(names.map((name) => [name, new Texels(gl, name)]));
     this.order = new Texels(gl, "order");
     this.still = textures(STILL);
@@ -39,8 +49,6 @@ export class Graphics {
     const rows = Math.max(Math.ceil(scene.gaussians / (1 << ROW_BITS)), 1);
     this.splats = target(gl, [gl.RGBA32UI, gl.RGBA32UI], 1 << ROW_BITS, rows);
     this.quads = quadIndices(gl, BATCH);
-    // 8 bits lose faint splats
-    this.format = gl.getExtension("EXT_color_buffer_float") ? gl.RGBA16F : gl.RGBA8;
     this.frame = null;
   }
 
@@ -65,16 +73,17 @@ export class Graphics {
     const { gl, canvas } = this;
     const { width, height } = view;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
-    gl.disable(gl.BLEND);
     this.#project(view, this.poses[first.slot], this.poses[second.slot], share, channel);
     if (this.frame?.width !== width || this.frame?.height !== height) {
       this.frame?.remove();
-      this.frame = target(gl, [this.format], width, height);
+      this.frame = target(gl, [gl.RGB10_A2], width, height); // 8 bits lose faint splats
     }
     this.#blend(channel === "rgb" ? this.scene.metadata.background : [0, 0, 0]);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
-    gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.disable(gl.BLEND);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    this.resolve.use();
+    this.resolve.bind(this.frame.textures);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
   #project(view, before, after, share, channel) {
@@ -101,11 +110,11 @@ export class Graphics {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  #blend([red, green, blue]) {
+  #blend(background) {
     const { gl, blend, frame, found } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, frame.framebuffer);
     gl.viewport(0, 0, frame.width, frame.height);
-    gl.clearColor(red, green, blue, 1);
+    gl.clearColor(...background.map((x) => x / BRIGHTEST), 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
     if (!found) return;
     blend.use();

@@ -6,7 +6,6 @@ import { readSceneFile } from "./scene_file.js";
 const POSED = ["means", "quats", "scales"];
 const APPEARANCE = ["opacities", "sh"];
 const CHUNK = 2048; // Gaussians per call of a graph that runs layers on Gaussians
-const TRIALS = 3;
 
 class Poser {
   /** Load onnxruntime-web and a scene. `runtime` has the addresses of onnxruntime-web's files. */
@@ -31,8 +30,10 @@ class Poser {
     return poser;
   }
 
-  constructor(ort, { metadata, inputs, idCount }) {
-    Object.assign(this, { ort, metadata, inputs, moving: idCount, chunk: Infinity, ids: new Map() });
+  constructor(ort, { metadata, inputs, idCount, selectsLast }) {
+    // called for chunks, of which values stay in the processor's cache, or once if it computes all in any case
+    const chunk = inputs.has("ids") && inputs.has("steps") && !selectsLast ? CHUNK : Infinity;
+    Object.assign(this, { ort, metadata, inputs, moving: idCount, chunk, ids: new Map() });
   }
 
   async #start(bytes) {
@@ -52,22 +53,6 @@ class Poser {
       ...POSED.map((name) => `static_${name}`),
       ...APPEARANCE.map((name) => (this.changing.includes(name) ? `static_${name}` : name)),
     ];
-    if (this.inputs.has("steps") && this.inputs.has("ids") && this.moving > CHUNK) await this.#choosesChunk();
-  }
-
-  /** Layers on Gaussians are called for chunks of them, of which values stay in the processor's cache; on control nodes
-   * once for all, as a call computes all in any case. The file doesn't say which it has. */
-  async #choosesChunk() {
-    const least = async (count) => {
-      let shortest = Infinity;
-      for (let trial = 0; trial < TRIALS; trial += 1) {
-        const start = performance.now();
-        await this.#run(this.posed, this.metadata.time_range[0], undefined, 0, count);
-        shortest = Math.min(shortest, performance.now() - start);
-      }
-      return shortest;
-    };
-    if ((await least(CHUNK)) > 2 * (await least(1))) this.chunk = CHUNK;
   }
 
   get facts() {
@@ -83,7 +68,7 @@ class Poser {
 
   /** The arrays of the moving Gaussians at `t` after `steps` layers, all if undefined. */
   async pose(t, steps) {
-    if (!this.inputs.has("ids") || this.chunk >= this.moving) {
+    if (this.chunk >= this.moving) {
       const outputs = await this.#run(this.posed, t, steps, 0, this.moving);
       return Object.fromEntries(this.posed.map((name) => [name, outputs[name].data]));
     }

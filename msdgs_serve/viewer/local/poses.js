@@ -1,8 +1,7 @@
 // Which poses are shown at a time, and which one is asked for next.
 
 const SLOTS = 3; // poses that are kept: two that are shown, and the next
-const AHEAD = 2; // times that a pose takes: the next one arrives before the display has passed this one
-const FRAME = 1 / 60; // seconds between poses of playback, if posing takes less
+const AHEAD = 2; // times until a pose is there: the next one is asked for then, and there before this one is passed
 const SMOOTHING = 0.3; // weight of the newest measurement
 const LEAP = 4; // times the way ahead: a jump in time
 
@@ -10,7 +9,8 @@ export class Poses {
   /** `ask({ t, steps, slot })` asks for a pose, which is given to `received`. */
   constructor({ interpolates, range }, ask) {
     Object.assign(this, { interpolates, range, ask });
-    this.seconds = FRAME; // that a pose takes
+    this.seconds = 0; // that a pose takes
+    this.interval = 0; // seconds between frames of playback
     this.forget();
   }
 
@@ -24,9 +24,14 @@ export class Poses {
 
   received(pose, milliseconds) {
     this.isAsking = false;
-    this.seconds += SMOOTHING * (milliseconds / 1000 - this.seconds);
+    const seconds = milliseconds / 1000;
+    this.seconds = Math.max(smoothed(this.seconds, seconds), seconds); // a late pose shows
     const earlier = this.kept.filter((each) => each.t < pose.t && each.steps === pose.steps);
     this.kept = this.interpolates ? [...earlier, pose] : [pose];
+  }
+
+  failed() {
+    this.isAsking = false;
   }
 
   /**
@@ -52,7 +57,7 @@ export class Poses {
 
   #askAhead(t, steps, now) {
     this.#measureRate(t, now);
-    const ahead = AHEAD * Math.max(this.seconds, FRAME) * this.rate;
+    const ahead = AHEAD * (this.seconds + this.interval) * this.rate;
     const [first, latest] = [this.kept[0], this.kept.at(-1)];
     const next = Math.min(t + ahead, this.range[1]);
     const isElsewhere =
@@ -70,10 +75,14 @@ export class Poses {
   }
 
   #measureRate(t, now) {
+    if (t === this.last?.t) return;
     if (this.last && t > this.last.t && now > this.last.now) {
-      const rate = (t - this.last.t) / (now - this.last.now);
-      this.rate = this.rate ? this.rate + SMOOTHING * (rate - this.rate) : rate;
+      const interval = now - this.last.now;
+      this.interval = smoothed(this.interval, interval);
+      this.rate = smoothed(this.rate, (t - this.last.t) / interval);
     }
-    if (t !== this.last?.t) this.last = { t, now };
+    this.last = { t, now };
   }
 }
+
+const smoothed = (mean, value) => (mean ? mean + SMOOTHING * (value - mean) : value);

@@ -2,20 +2,27 @@
 // onnxruntime-web neither returns metadata nor takes inputs that have a default.
 
 const [GRAPH, METADATA] = [7, 14]; // fields of ModelProto
-const [INITIALIZER, INPUT] = [5, 11]; // fields of GraphProto
+const [NODE, INITIALIZER, INPUT] = [1, 5, 11]; // fields of GraphProto
+const [NODE_INPUT, NODE_OUTPUT] = [1, 2]; // fields of NodeProto
+const POSED = ["means", "quats", "scales", "opacities", "sh"]; // outputs
 const UNUSED = (3 << 3) | 2; // tag of a field that GraphProto doesn't have: readers skip it
 const CONTRACTS = ["msdgs/1", "msdgs/2"];
+const NEEDED = [
+  "layers", "plan", "time_range", "bounds", "sh_degree", "delta_space", "background", "antialiasing", "cameras",
+  "left_out", "measured_error", "package_version", "checkpoint_sha256",
+]; // prettier-ignore
 const TRUNCATED = "The scene file ends too early: it was not copied or sent as a whole.";
 
 /**
  * Read a scene file, and remove the defaults of `ids` and `steps` from it in place: a byte of each, so that nothing is
- * copied. Returns the values of `metadata_props`, the set of the graph's inputs, and the length of the default of `ids`,
- * null without it. Throws an Error for a file that isn't a whole scene file.
+ * copied. Returns the values of `metadata_props`, the set of the graph's inputs, the length of the default of `ids`, null
+ * without it, and whether the graph poses all Gaussians and then selects `ids`. Throws an Error for a file that isn't a
+ * whole scene file.
  * @param {Uint8Array} bytes
  */
 export function readSceneFile(bytes) {
   const [metadata, inputs] = [{}, new Set()];
-  let idCount = null;
+  let [idCount, selectsLast] = [null, true];
   for (const field of fields(bytes, 0, bytes.length)) {
     if (field.number === METADATA) {
       const [key, value] = texts(bytes, field);
@@ -23,6 +30,9 @@ export function readSceneFile(bytes) {
     } else if (field.number === GRAPH) {
       for (const part of fields(bytes, field.start, field.end)) {
         if (part.number === INPUT) inputs.add(textOf(bytes, part, 1));
+        if (part.number === NODE && readsIds(bytes, part)) {
+          selectsLast &&= POSED.includes(textOf(bytes, part, NODE_OUTPUT));
+        }
         if (part.number !== INITIALIZER) continue;
         const name = textOf(bytes, part, 8);
         if (name !== "ids" && name !== "steps") continue;
@@ -35,7 +45,9 @@ export function readSceneFile(bytes) {
   if (!CONTRACTS.includes(metadata.contract)) {
     throw new Error(`The scene file has the contract ${metadata.contract}; this page reads ${CONTRACTS.join(" and ")}.`);
   }
-  return { metadata, inputs, idCount };
+  const missing = NEEDED.find((name) => !(name in metadata));
+  if (missing || !inputs.has("t")) throw new Error(`The scene file lacks “${missing ?? "t"}”.`);
+  return { metadata, inputs, idCount, selectsLast };
 }
 
 /** Yield the fields of a message: its number, the place of its tag, and where its value starts and ends. */
@@ -78,6 +90,13 @@ const texts = (bytes, { start, end }) => [...fields(bytes, start, end)].map((fie
 function textOf(bytes, { start, end }, number) {
   for (const field of fields(bytes, start, end)) if (field.number === number) return decoded(bytes, field);
   return "";
+}
+
+function readsIds(bytes, { start, end }) {
+  for (const field of fields(bytes, start, end)) {
+    if (field.number === NODE_INPUT && decoded(bytes, field) === "ids") return true;
+  }
+  return false;
 }
 
 /** The first dimension of a TensorProto. */

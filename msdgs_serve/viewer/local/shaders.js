@@ -12,9 +12,13 @@ export const MOVING = ["means", "quats", "scales"];
 /** Samplers of `projectShader` in the order of their texture units; of poses the earlier and the later one. */
 export const samplersOf = (posed) => ["order", ...STILL, ...posed.flatMap((name) => [`${name}A`, `${name}B`])];
 
+export const NEAR_PLANE = 0.01; // scene units
+
+/** The color that is 1 in the frame: colors of splats, and so those behind others, may be above what is shown. */
+export const BRIGHTEST = "2.0";
+
 const ALPHA_MIN = "(1.0 / 255.0)";
 const ALPHA_MAX = "0.999";
-const NEAR_PLANE = "0.01";
 
 /** A triangle over all of a target. */
 export const EVERYWHERE = `#version 300 es
@@ -43,8 +47,10 @@ uniform float eps2d;
 uniform bool mip;
 uniform int channel; // 0: color, 1: alpha, 2: depth
 uniform vec2 depths; // of the depth channel: nearest, farthest
-layout(location = 0) out uvec4 placed; // center and the longer half-axis at one standard deviation, pixels
-layout(location = 1) out uvec4 painted; // the other half-axis, and color and opacity as halves; 0 if it isn't drawn
+// Of the ellipse outside of which alpha is below the cut-off: its center and its longer half-axis, in pixels.
+layout(location = 0) out uvec4 placed;
+// The ratio of its half-axes, 0 if it isn't drawn; the color as halves; log2 of the opacity.
+layout(location = 1) out uvec4 painted;
 
 vec4 at(sampler2D texture_, int k) {
   return texelFetch(texture_, ivec2(k & ${(1 << ROW_BITS) - 1}, k >> ${ROW_BITS}), 0);
@@ -122,12 +128,15 @@ void main() {
   float half_ = 0.5 * (xx - yy), radius = length(vec2(half_, xy)), large = 0.5 * (xx + yy) + radius;
   vec2 along = half_ > 0.0 ? vec2(radius + half_, xy) : vec2(xy, radius - half_);
   along = radius > 0.0 ? normalize(along) : vec2(1.0, 0.0);
-  vec2 major = sqrt(large) * along, minor = sqrt(det / large) * vec2(-along.y, along.x);
+  vec2 major = sqrt(reach * large) * along;
   vec3 color = vec3(1.0);
   if (channel == 0) color = seenColor(i, normalize(mean - eye));
   else if (channel == 2) color -= 0.85 * clamp((p.z - depths.x) / (depths.y - depths.x), 0.0, 1.0);
   placed = floatBitsToUint(vec4(center, major));
-  painted = uvec4(floatBitsToUint(minor), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, opacity)));
+  float ratio_ = sqrt(det) / large;
+  painted = uvec4(
+    floatBitsToUint(ratio_), packHalf2x16(color.rg), packHalf2x16(vec2(color.b, 0.0)), floatBitsToUint(log2(opacity))
+  );
 }`;
 }
 
@@ -153,20 +162,20 @@ precision highp int;
 uniform highp usampler2D placed, painted;
 uniform vec2 size;
 uniform int found;
-out vec2 place; // standard deviations
-flat out vec4 splat; // color and opacity
+out vec2 place; // 1 at the edge of the ellipse
+flat out vec4 splat; // color, and log2 of the opacity
 void main() {
-  int k = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
-  place = vec2(0.0);
+  place = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
   splat = gl_Position = vec4(0.0); // all corners at one point
+  int k = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
   if (k >= found) return;
   ivec2 texel = ivec2(k & ${(1 << ROW_BITS) - 1}, k >> ${ROW_BITS});
-  uvec4 a = texelFetch(placed, texel, 0), b = texelFetch(painted, texel, 0);
-  splat = vec4(unpackHalf2x16(b.z), unpackHalf2x16(b.w));
-  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
-  place = corner * sqrt(max(2.0 * log(255.0 * splat.a), 0.0));
-  vec2 center = uintBitsToFloat(a.xy), major = uintBitsToFloat(a.zw), minor = uintBitsToFloat(b.xy);
-  vec2 pixel = (center + place.x * major + place.y * minor) / size;
+  uvec4 b = texelFetch(painted, texel, 0);
+  if (b.x == 0u) return;
+  vec4 a = uintBitsToFloat(texelFetch(placed, texel, 0));
+  splat = vec4(unpackHalf2x16(b.y), unpackHalf2x16(b.z).x, uintBitsToFloat(b.w));
+  vec2 minor = uintBitsToFloat(b.x) * vec2(-a.w, a.z);
+  vec2 pixel = (a.xy + place.x * a.zw + place.y * minor) / size;
   gl_Position = vec4(pixel.x * 2.0 - 1.0, 1.0 - pixel.y * 2.0, 0.0, 1.0);
 }`;
 
@@ -176,8 +185,17 @@ in vec2 place;
 flat in vec4 splat;
 out vec4 pixel; // premultiplied
 void main() {
-  float alpha = splat.a * exp(-0.5 * dot(place, place));
-  if (alpha < ${ALPHA_MIN}) discard;
-  alpha = min(alpha, ${ALPHA_MAX});
-  pixel = vec4(splat.rgb * alpha, alpha);
+  float square = dot(place, place);
+  if (square > 1.0) discard;
+  float alpha = min(exp2(mix(splat.a, LOG2_ALPHA_MIN, square)), ${ALPHA_MAX});
+  pixel = vec4(splat.rgb * (alpha / ${BRIGHTEST}), alpha);
+}`.replace("LOG2_ALPHA_MIN", -Math.log2(255));
+
+/** The frame, for the canvas. */
+export const RESOLVE = `#version 300 es
+precision highp float;
+uniform sampler2D frame;
+out vec4 pixel;
+void main() {
+  pixel = vec4(texelFetch(frame, ivec2(gl_FragCoord.xy), 0).rgb * ${BRIGHTEST}, 1.0);
 }`;
