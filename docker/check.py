@@ -3,8 +3,8 @@
     python docker/check.py                                    with images from the default registry
     BASE_IMAGE=… PROXY_IMAGE=… python docker/check.py         with other images, such as local ones
 
-Environment variables: BASE_IMAGE, PIP_INDEX_URL, MSDGS_IMAGE, PROXY_IMAGE as in compose.yaml; CA_FILE, certificates for
-the build; BUILD_NETWORK, `host` if containers have no other; DOCKER, the command.
+Environment variables: BASE_IMAGE, PIP_INDEX_URL, NPM_REGISTRY, MSDGS_IMAGE, PROXY_IMAGE as in compose.yaml; CA_FILE,
+certificates for the build; BUILD_NETWORK, `host` if containers have no other; DOCKER, the command.
 Without a daemon it prints the reason and the exit status is 77. Containers, network and volumes are removed at the end.
 """
 
@@ -186,6 +186,7 @@ def check_cache(url: str) -> None:
     expect((keyed.status, keyed.body) == (304, b""), "their own ETags count")
     expect(get(f"{url}/metrics").status == 404, "metrics are not public")
     expect(get(f"{url}/").status == 200, "the viewer is served")
+    expect(get(f"{url}/viewer/onnxruntime-web/ort.js").status == 200, "the viewer can draw by itself")
 
 
 def check_revalidation(url: str) -> None:

@@ -13,6 +13,7 @@ lock() {
 }
 
 lock build "$into/build.in"
+lock npm "$into/npm.in"
 lock serve pyproject.toml --extra video
 # torch comes from an index of its own, with other hashes; here are only the packages that it needs
 lock train pyproject.toml "$into/torch_needs.in" --extra train --extra export --override "$into/no_torch.in"

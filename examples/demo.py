@@ -5,10 +5,13 @@ python examples/demo.py examples/toys.onnx
 
 import argparse
 import contextlib
+import shlex
 import time
 from pathlib import Path
 
 from serving import get, render, say, serving, stay_up
+
+SITE = "out/site"
 
 
 def main() -> None:
@@ -31,6 +34,9 @@ def main() -> None:
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
         arguments.out.write_bytes(frame)
         say(f"wrote {arguments.out}: {scene['gaussians']['total']:,} Gaussians at t = {request['t']}, {seconds:.2f} s")
+        scene_file = shlex.quote(str(arguments.scene))
+        say("a page that needs no service, with `pip install '.[export]'` and npm:")
+        say(f"$ msdgs-convert {scene_file} {SITE} --site && python -m http.server -d {SITE} 8001")
         if not arguments.once:
             stay_up(url)
 

@@ -1,7 +1,7 @@
 """The options of `msdgs-export` and `msdgs-convert`, without importing torch, so that `--help` is printed at once."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,6 +12,9 @@ from msdgs_train.settings import Flag, optional
 
 Kept = Literal["heads", "modulation", "layers", "invisible", "static", "sh", "float32"]
 """The rules of pruning, and float32."""
+
+WEB_MB, WEB_MIN_PSNR = 5.0, 40.0
+"""Megabytes of a file that a page loads in seconds, and dB that its frames keep: browsers draw about as exactly."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,9 @@ class ExportOptions:
     max_mb: Annotated[float | None, optional("MB")] = None
     """Largest size of the file, in megabytes of 10⁶ bytes. Alone: the highest PSNR that fits, at any speed. With
     --min-psnr: the fastest that keeps both."""
+    for_web: Flag = False
+    """Write what a web page wants, few bytes and cheap poses: the same as --max-mb 5 --min-psnr 40, either of which may
+    be given otherwise."""
     plan: Annotated[str | None, optional("PLAN")] = None
     """Write this plan, without a sweep: network, prefix:2, ...; an unknown one lists all."""
     quick: Flag = False
@@ -69,6 +75,15 @@ class ExportOptions:
     up: Annotated[str | None, optional("AXIS")] = None
     """Which direction is up in a splat or a sequence: x, y, z, -x, -y, -z, or three numbers such as 0 -1 0.2. By
     default what the file says, as those of ns-export do, otherwise -y."""
+
+    @property
+    def spelled_out(self) -> "ExportOptions":
+        """The same without `for_web`, but with what that stands for."""
+        if not self.for_web:
+            return self
+        max_mb = WEB_MB if self.max_mb is None else self.max_mb
+        min_psnr = WEB_MIN_PSNR if self.min_psnr is None else self.min_psnr
+        return replace(self, for_web=False, max_mb=max_mb, min_psnr=min_psnr)
 
     @property
     def scene_file(self) -> Path:
@@ -111,6 +126,8 @@ class ConvertOptions:
 
     msdgs-convert ball.onnx small.onnx        the scene file itself, with arrays in fewer bits
 
+    msdgs-convert ball.onnx site/ --site      a folder that any file server shows in a browser
+
     For videos use msdgs-render: msdgs-render ball.onnx turn.mp4. docs/formats.md lists what each format keeps.
     """
 
@@ -125,6 +142,16 @@ class ConvertOptions:
     min_psnr: Annotated[float | None, optional("DB")] = None
     """PSNR of the written file against the scene, below which it isn't kept; by default 45 for SPZ and Visionary,
     50 for scene files, and 60 for the others, which are lossless."""
+    site: Flag = False
+    """Write a folder of files with a page that draws the scene in browsers, and no server."""
+    title: Annotated[str | None, optional("TEXT")] = None
+    """The title of a site's page; by default the scene's name."""
+    description: Annotated[str | None, optional("TEXT")] = None
+    """What search engines and links say of a site."""
+    url: Annotated[str | None, optional("URL")] = None
+    """The address that a site's folder will have, so that links to it show its picture."""
+    onnxruntime_web: Annotated[Path | None, optional("DIR")] = None
+    """Folder of the npm package onnxruntime-web, whose files a site holds; by default npm fetches it the first time."""
 
 
 def with_values_of_up(arguments: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.frames import extract_frames
-from msdgs_train.capture.masked_poses import Progress, find_masked_poses, step_names
+from msdgs_train.capture.masked_poses import Keep, Progress, find_masked_poses, step_names
 from msdgs_train.capture.offsets import find_offsets
 from msdgs_train.capture.poses import Poses, find_poses
 from tests.support.clips import Clip, fixed_camera_clips, moving_camera_clip
@@ -88,13 +88,20 @@ def _with_and_without(video: Path, folder: Path, seed: int, threads: int) -> lis
     images = folder / "images"
     taken = extract_frames([video], images)
 
+    masked = find_masked_poses(images, taken, _run_in(folder), seed=seed, threads=threads)
+    first = Poses.load(folder / step_names()[0], taken)
+    return [("without masks", first, taken), (f"masks, {masked.passes} passes", masked.poses, taken)]
+
+
+def _run_in(folder: Path) -> Keep:
+    """Runs each step, in a folder of its name."""
+
     def keep(name: str, run: Callable[[Path, Progress], None]) -> Path:
+        (folder / name).mkdir(parents=True)
         run(folder / name, _progress)
         return folder / name
 
-    masked = find_masked_poses(images, taken, keep, seed=seed, threads=threads)
-    first = Poses.load(folder / step_names()[0], taken)
-    return [("without masks", first, taken), (f"masks, {masked.passes} passes", masked.poses, taken)]
+    return keep
 
 
 def rig_row(rig: list[Clip], folder: Path, seed: int, threads: int) -> tuple[float, list[str]]:

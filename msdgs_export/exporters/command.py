@@ -11,6 +11,7 @@ from rich.progress import track
 from msdgs_export.exporters.gltf import read_gltf, write_gltf
 from msdgs_export.exporters.ply import write_ply
 from msdgs_export.exporters.round_trip import ConversionFailed, RoundTrip, require, visionary_of
+from msdgs_export.exporters.site.folder import write_site
 from msdgs_export.exporters.spz import write_spz
 from msdgs_export.exporters.usd import read_usd, write_usd
 from msdgs_export.exporters.visionary import visionary_model
@@ -50,6 +51,10 @@ def convert(options: ConvertOptions, console: Console) -> None:
     """Write, read back, compare. Raises `InvalidInput`, `SceneFileInvalid` and `ConversionFailed`; a file below the
     minimum PSNR doesn't replace an old one."""
     out = options.out
+    if options.site:
+        write_site(DeformationSession(options.scene), options, console)
+        return
+    _refuse_options_of_sites(options)
     if out.suffix in VIDEOS:
         raise InvalidInput("out", f"other than a video: msdgs-render {options.scene} {out} writes one", out.name)
     if out.name.lower().endswith(COMPRESSED):
@@ -82,6 +87,12 @@ def convert(options: ConvertOptions, console: Console) -> None:
     if eps2d != GSPLAT.eps2d:
         drawn = "blurrier" if eps2d < GSPLAT.eps2d else "sharper"
         console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
+
+
+def _refuse_options_of_sites(options: ConvertOptions) -> None:
+    for name in ("title", "description", "url", "onnxruntime_web"):
+        if getattr(options, name) is not None:
+            raise InvalidInput(name, "given with --site", getattr(options, name))
 
 
 def _written_units(file: Path, metadata: SceneMetadata) -> float:

@@ -1,76 +1,39 @@
-"""The inputs of `msdgs-export` other than a model.pt."""
+"""The inputs of `msdgs-export`."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
 
-from msdgs_export.importers.detect import checked_format, detect_format, frame_files
+from msdgs_export.importers.detect import frame_files
 from msdgs_export.importers.polynomial import at_time, polynomial_scene
-from msdgs_export.importers.runs.model import RUNS, write_model
-from msdgs_export.importers.scene import digest, note_left_out, static_scene, write_imported
+from msdgs_export.importers.runs.model import write_model
+from msdgs_export.importers.scene import digest, static_scene, write_imported
 from msdgs_export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
-from msdgs_export.importers.splats.axes import up_direction
-from msdgs_export.importers.splats.formats import READERS, read_splats, refuse_pointer
+from msdgs_export.importers.splats.formats import READERS, read_splats
 from msdgs_export.importers.splats.sog import META
-from msdgs_export.options import ExportOptions, require_folder_of
 from msdgs_export.progress import tracked
-from msdgs_export.target import MIN_PSNR
 from msdgs_serve.scene.baked import BakedScene
-from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import scratch_folder
-
-FOR_SPLATS = ("model", "output", "format", "min_psnr", "keep", "duration", "up")
-"""The options that splats and sequences have; nothing is pruned or fitted."""
 
 POLYNOMIAL_TIMES = 9
 """At which a scene of moving Gaussians is compared with its file."""
 
 
 @contextmanager
-def model_or_import(options: ExportOptions, console: Console) -> Iterator[Path | None]:
-    """The model.pt to export: the given one, or a temporary one that is made from another trainer's run.
-
-    Splats and sequences are written as scene files directly, in fewer bits unless these are switched off; the result is
-    then None. Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`.
-    """
-    path, file_format, output = options.model, options.format, options.scene_file
-    if path.is_file():
-        refuse_pointer(path)
-    if file_format == "detect":
-        file_format = "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
-    file_format = checked_format(file_format)
-    require_folder_of("output", output)
-    if options.up is not None and file_format in ("model", *RUNS):
-        raise InvalidInput("up", "left out: it is for splats; a trained model is upright in its cameras", options.up)
+def trained_model(path: Path, file_format: str, console: Console) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
+    """The model.pt of an input of one of `TRAINED`, the given one or a temporary one that is made from another
+    trainer's run; and entries for `left_out`. Raises `ImportFailed`."""
     if file_format == "model":
-        yield path / "model.pt" if path.is_dir() else path
-    elif file_format in RUNS:
-        if file_format == "4dgs" and options.data is not None and (options.data / "dataset.json").exists():
-            raise InvalidInput("data", "left out: 4DGaussians trains in HyperNeRF's unscaled coordinates", options.data)
+        yield (path / "model.pt" if path.is_dir() else path), []
+    else:
         with scratch_folder() as folder:
             model = folder / "model.pt"
-            lost = write_model(path, file_format, model, console)
-            yield model
-            if lost:
-                note_left_out(output, lost)
-    else:
-        for field in fields(options):
-            if field.name not in FOR_SPLATS and getattr(options, field.name) != field.default:
-                raise InvalidInput(field.name, "left out: it is for trained models", str(getattr(options, field.name)))
-        if pruning := " ".join(part for part in options.keep if part != "float32"):
-            raise InvalidInput("keep", "left out, or float32: nothing of a splat is pruned", pruning)
-        if not options.packs and options.min_psnr is not None:
-            raise InvalidInput("min_psnr", "left out with --keep float32", options.min_psnr)
-        min_psnr = None if not options.packs else MIN_PSNR if options.min_psnr is None else options.min_psnr
-        imported = Import(path, file_format, output, min_psnr, None if options.up is None else _up(options.up))
-        write = _splats if file_format in READERS else _sequence
-        _print(write(imported, console), output, console)
-        yield None
+            yield model, write_model(path, file_format, model, console)
 
 
 class Import(NamedTuple):
@@ -83,11 +46,10 @@ class Import(NamedTuple):
     up: np.ndarray | None  # [3] unit; None: what the file says
 
 
-def _up(text: str) -> np.ndarray:
-    found = up_direction(text)
-    if found is None:
-        raise InvalidInput("up", "x, y, z, -x, -y, -z or three finite numbers that aren't all 0", repr(text))
-    return found
+def import_scene(job: Import, console: Console) -> None:
+    """Write a splat or a sequence as a scene file. Raises `ImportFailed`, `InvalidInput` and `SceneFileInvalid`."""
+    write = _splats if job.format in READERS else _sequence
+    _print(write(job, console), job.output, console)
 
 
 def _warn(warnings: Sequence[str], console: Console) -> None:

@@ -6,13 +6,30 @@ from pathlib import Path
 
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.runs.model import RUNS, run_format
-from msdgs_export.importers.splats.formats import READERS, splat_format
+from msdgs_export.importers.splats.formats import READERS, refuse_pointer, splat_format
 from msdgs_serve.scene.errors import InvalidInput
 
 FORMATS = ("model", *READERS, "sequence", "sequence:blend", "sequence:switch", *RUNS)
 """All inputs: our own model.pt, one set of Gaussians, a folder of them, and runs of other trainers."""
 
+TRAINED = ("model", *RUNS)
+"""Inputs with a trained model, which is pruned and fitted."""
+
 FRAMES = (".ply", ".sog", ".spz", ".splat", ".ksplat", ".ply.gz")
+
+
+def input_format(path: Path, asked: str) -> str:
+    """The format of `path`, one of `FORMATS`: the one asked for, or with `detect` what its contents are.
+
+    Raises `InvalidInput` for another format, and `ImportFailed`.
+    """
+    if path.is_file():
+        refuse_pointer(path)
+    if asked not in ("detect", *FORMATS):
+        raise InvalidInput("format", f"detect or one of {', '.join(FORMATS)}", repr(asked))
+    if asked != "detect":
+        return asked
+    return "model" if not path.exists() or path.suffix == ".pt" else detect_format(path)
 
 
 def detect_format(path: Path) -> str:
@@ -28,13 +45,6 @@ def detect_format(path: Path) -> str:
     if found is None:
         raise ImportFailed(path, f"has no known format; --format names it, one of {', '.join(FORMATS)}")
     return found
-
-
-def checked_format(text: str) -> str:
-    """One of `FORMATS`. Raises `InvalidInput` for anything else."""
-    if text not in FORMATS:
-        raise InvalidInput("format", f"detect or one of {', '.join(FORMATS)}", repr(text))
-    return text
 
 
 def frame_files(folder: Path) -> list[Path]:

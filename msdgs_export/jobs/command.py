@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,10 +20,9 @@ from msdgs_export.jobs.ruler import Ruler
 from msdgs_export.jobs.sweep import Sweep
 from msdgs_export.jobs.write import Exported, write_scene
 from msdgs_export.options import ExportOptions
-from msdgs_export.plans.registry import parse
 from msdgs_export.progress import Track, tracked
 from msdgs_export.pruning import RULES
-from msdgs_export.target import Target, check_min_psnr, default_min_psnr
+from msdgs_export.target import Target, default_min_psnr
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.gaussians.model_file import load_model
@@ -40,13 +38,15 @@ NARROW_COLUMNS = ("", "plan", "pruned to", "SH", "moving", "ms", "MB", "worst fr
 
 
 def export(model: Path, options: ExportOptions, console: Console) -> None:
-    """Choose a candidate, verify it and write it. An error leaves files that were there as they are."""
-    _check(options)
+    """Choose a candidate, verify it and write it. An error leaves files that were there as they are.
+
+    `options` are those that a trained model has, with valid values.
+    """
     with scratch_folder() as folder, tracked(console) as track:
         images = _held_out_images(model, options.data, track)
         checkpoint = Checkpoint.load(model)
         ruler = Ruler(checkpoint, images, track)
-        target = _target(options, ruler)
+        target = _target(options.min_psnr, options.max_mb, ruler, packs=options.packs)
         rules = [rule for rule in RULES if rule not in options.keep]
         builder = CandidateBuilder.of(checkpoint, ruler, target, folder, rules)
         result = contents = None
@@ -80,19 +80,6 @@ def export(model: Path, options: ExportOptions, console: Console) -> None:
     _print_chosen(chosen, exported, console)
 
 
-def _check(options: ExportOptions) -> None:
-    if options.min_psnr is not None:
-        check_min_psnr(options.min_psnr)
-    if options.max_mb is not None and not 0 < options.max_mb < math.inf:
-        raise InvalidInput("max_mb", "a positive number of megabytes, 10⁶ bytes each", options.max_mb)
-    if not options.tolerance >= 0:
-        raise InvalidInput("tolerance", "0 or more", options.tolerance)
-    if options.times < 2:
-        raise InvalidInput("times", "2 or more", options.times)
-    if options.chosen_plan is not None:
-        parse(options.chosen_plan)
-
-
 def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutImages | None:
     if data is None:
         return None
@@ -105,12 +92,11 @@ def _held_out_images(model: Path, data: Path | None, track: Track) -> HeldOutIma
     return HeldOutImages(data, load_model(model).scene, lambda count: track("images", count))
 
 
-def _target(options: ExportOptions, ruler: Ruler) -> Target:
+def _target(asked_psnr: float | None, max_mb: float | None, ruler: Ruler, *, packs: bool) -> Target:
     """What was asked for; a PSNR that wasn't is made from the error of the exact frames against held-out images."""
-    min_psnr = default_min_psnr(ruler.exact_images_psnr) if options.min_psnr is None else options.min_psnr
-    max_bytes = None if options.max_mb is None else round(1e6 * options.max_mb)
-    bytes_only = max_bytes is not None and options.min_psnr is None
-    return Target(min_psnr, max_bytes, bytes_only=bytes_only, packs=options.packs)
+    min_psnr = default_min_psnr(ruler.exact_images_psnr) if asked_psnr is None else asked_psnr
+    max_bytes = None if max_mb is None else round(1e6 * max_mb)
+    return Target(min_psnr, max_bytes, bytes_only=max_bytes is not None and asked_psnr is None, packs=packs)
 
 
 def _print_table(contents: dict, console: Console) -> None:

@@ -49,6 +49,7 @@ def create_app(store: SceneStore, renderer: Renderer, settings: Settings) -> Fas
         redirect_slashes=False,  # see msdgs_serve.api.errors
     )
     app.state.service = service
+    app.state.page_files = viewer.PageFiles(settings.onnxruntime_web)
     for calls in (render, batch, video, scenes, health, viewer):
         app.include_router(calls.router)
     install_error_handlers(app)

@@ -55,6 +55,10 @@ class CommonSettings(BaseModel):
     root_path: Annotated[str, AfterValidator(_prefix)] = Field(
         default="", description="Path below which a proxy serves, such as /msdgs; X-Forwarded-Prefix replaces it."
     )
+    onnxruntime_web: Path | None = Field(
+        default=None,
+        description="Folder of the npm package onnxruntime-web, with which the web page can draw scenes by itself.",
+    )
     frame_max_age: int = Field(
         default=0, ge=0, description="Seconds that caches may keep a frame without revalidation."
     )

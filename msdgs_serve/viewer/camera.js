@@ -5,6 +5,7 @@ import { add, cross, dot, length, scaled, unit } from "./vector.js";
 const STEEPEST = 89;
 const MIN_RADIUS = 1e-3; // of depth ranges, as a fraction of the scene's distance
 const DEGREES = 180 / Math.PI;
+const WIDEST = 170 / DEGREES; // field of view
 
 export class Camera {
   /** `view` is `view` of GET /scenes/{name}. */
@@ -121,9 +122,26 @@ export class Camera {
       elevation: short(this.elevation),
       distance: short(this.distance, this.distance),
       target: this.target.map((x) => short(x, this.distance)),
-      fov_y: short(Math.min(2 * Math.atan(this.half) * DEGREES, 170)),
+      fov_y: short(Math.min(2 * Math.atan(this.half), WIDEST) * DEGREES),
     };
   }
+}
+
+/** Return the view as a pinhole camera, with the pose of `camera_to_world` [4 × 4] in OpenCV's axes and lengths in pixels. */
+export function pinhole(camera, scene, { width, height }) {
+  if (camera.sceneCamera !== null) {
+    const stored = scene.cameras[camera.sceneCamera];
+    const [x, y] = [width / stored.width, height / stored.height];
+    const { fx, fy, cx, cy, camera_to_world } = stored;
+    return { fx: x * fx, fy: y * fy, cx: x * cx, cy: y * cy, width, height, camera_to_world };
+  }
+  const { right, above, forward } = camera.axes;
+  const { eye } = camera;
+  const focal = height / 2 / Math.min(camera.half, Math.tan(WIDEST / 2));
+  return {
+    fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height,
+    camera_to_world: [...[0, 1, 2].map((i) => [right[i], -above[i], forward[i], eye[i]]), [0, 0, 0, 1]],
+  }; // prettier-ignore
 }
 
 /** Return a depth range of the scene that is stable while the camera moves; ignores a few distant Gaussians. */

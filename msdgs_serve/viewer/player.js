@@ -16,6 +16,7 @@ export class Player {
     this.playing = false;
     this.loop = true;
     this.speed = 1;
+    this.isSmooth = false; // whether playback shows any time, not only some
   }
 
   /** Take over times of a scene, GET /scenes/{name}. */
@@ -69,6 +70,6 @@ export class Player {
       return;
     }
     this.exact %= 1;
-    this.place = Math.floor(this.exact * TIME_STEPS) / TIME_STEPS;
+    this.place = this.isSmooth ? this.exact : Math.floor(this.exact * TIME_STEPS) / TIME_STEPS;
   }
 }

@@ -1,18 +1,6 @@
-// Exports a frame as a command, a file or a URL.
+// The view as a URL; texts and files for other programs.
 
-import { readKey } from "./api.js";
 import { short } from "./camera.js";
-
-/** Return the curl command for the frame, without the API key. */
-export function curlCommand(body) {
-  const key = readKey() ? " -H \"Authorization: Bearer $MSDGS_KEY\"" : "";
-  const address = quoted(new URL("render", document.baseURI).href);
-  const output = `-o frame.${body.format}`;
-  return `curl ${address}${key} -H 'Content-Type: application/json' ${output} -d ${quoted(JSON.stringify(body))}`;
-}
-
-/** Quote a text for a shell. */
-const quoted = (text) => `'${text.replaceAll("'", "'\\''")}'`;
 
 /** Return the address of the page with a view. */
 export const linkTo = (state) => new URL(toHash(state), location.href).href;
@@ -41,11 +29,10 @@ function copySelected(text) {
   return isCopied;
 }
 
-/** Save the body of a response as a file. */
-export async function save(response, name) {
-  const blob = await response.blob();
+/** Save a Blob as a file. */
+export function save(contents, name) {
   const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
+  link.href = URL.createObjectURL(contents);
   link.download = name;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 60_000);

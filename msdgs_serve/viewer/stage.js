@@ -41,28 +41,36 @@ export class Stage {
     this.status.textContent = "\u00a0";
   }
 
-  show(bitmap, { width, height, full, seconds, stages }) {
+  show(bitmap, { width, height }) {
     if (this.canvas.width !== width || this.canvas.height !== height) {
       [this.canvas.width, this.canvas.height] = [width, height];
     }
     this.context.drawImage(bitmap, 0, 0);
-    this.canvas.dataset.shown = full ? "full" : "moving";
-    this.#tell(width, height, full, seconds, stages);
+  }
+
+  /** Return a new canvas that covers the image; pointers and keys pass through it. */
+  addCanvas() {
+    const canvas = document.createElement("canvas");
+    this.canvas.after(canvas);
+    return canvas;
   }
 
   onResize(action) {
     new ResizeObserver(action).observe(this.canvas);
   }
 
-  #tell(width, height, full, seconds, stages) {
+  /** Tell of a frame: who drew it (`label`), its size, and if known the seconds that it took, also by stage. */
+  tell({ label, width, height, full, seconds, stages = {} }) {
+    this.canvas.dataset.shown = full ? "full" : "moving";
     const now = performance.now();
     const between = (now - this.shownAt) / 1000;
     this.shownAt = now;
     if (between < 1) this.rate = this.rate ? this.rate + 0.2 * (1 / between - this.rate) : 1 / between;
     else this.rate = 0;
-    const parts = [`${width} × ${height}`, duration(seconds)];
+    const parts = [label, `${width} × ${height}`];
+    if (seconds) parts.push(duration(seconds));
     if (!full && this.rate) parts.push(`${Math.round(this.rate)} frames/s`);
-    if (full) for (const name of ["pose", "draw", "encode"]) parts.push(`${name} ${duration(stages[name] ?? 0)}`);
+    if (full) for (const [name, taken] of Object.entries(stages)) parts.push(`${name} ${duration(taken)}`);
     this.status.textContent = parts.join(" · ");
   }
 }

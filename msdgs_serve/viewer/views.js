@@ -7,29 +7,36 @@ export class Views {
   constructor(form, chosen) {
     this.buttons = form.elements.view;
     this.names = [...this.buttons].map((button) => button.value);
-    this.motion = form.querySelector(`[value=${MOTION}]`);
+    this.drawn = []; // by the source of frames
+    this.moves = false; // whether the scene has motion
     form.addEventListener("change", ({ target }) => chosen(target.value));
   }
 
-  /** The view that is shown: the chosen one, or color if the scene doesn't have that. */
+  /** The view that is shown: the chosen one, or color if that isn't offered. */
   get current() {
-    return this.#offers(this.buttons.value) ? this.buttons.value : this.names[0];
+    return this.#lack(this.buttons.value) ? this.names[0] : this.buttons.value;
   }
 
-  /** Offer what a scene has, GET /scenes/{name}, and show a view. Returns whether the scene has it; color if not. */
-  open({ motion }, wanted) {
-    this.motion.setAttribute("aria-disabled", !motion);
-    return this.show(wanted) || !this.show(this.names[0]);
+  /** Offer those of `drawn` that a scene has, GET /scenes/{name}, and show a view, or color. Returns what `show` does. */
+  open({ motion }, drawn, wanted) {
+    [this.drawn, this.moves] = [drawn, motion];
+    for (const button of this.buttons) button.setAttribute("aria-disabled", this.#lack(button.value) !== "");
+    const lack = this.show(wanted);
+    if (lack) this.show(this.names[0]);
+    return lack;
   }
 
-  /** Show a view. Returns whether it is offered. */
+  /** Show a view, if it is offered. Returns why it isn't, in words; an empty text if it is. */
   show(name) {
-    const isOffered = this.#offers(name);
-    if (isOffered) this.buttons.value = name;
-    return isOffered;
+    const lack = this.#lack(name);
+    if (!lack) this.buttons.value = name;
+    return lack;
   }
 
-  #offers(name) {
-    return this.names.includes(name) && !(name === MOTION && this.motion.getAttribute("aria-disabled") === "true");
+  #lack(name) {
+    if (!this.names.includes(name)) return "The link asks for a view that doesn’t exist: this is the color.";
+    if (!this.drawn.includes(name)) return "This view is drawn by the service only: this is the color.";
+    if (name !== MOTION || this.moves) return "";
+    return "Nothing moves in this scene that could be shown as motion: this is its color.";
   }
 }

@@ -29,12 +29,15 @@ MAX_EXTRA_PARAMETER = 0.5
 BACKGROUND_PEAK = 0.002
 """Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is
 but one view of each camera."""
+FOCALS = (0.3, 6.0)
+"""Focal lengths in long sides of the image: views of 118° to 10°."""
 MIN_MODEL = 3
 """Images of the smallest model."""
 MIN_MATCHES = 30
 """Of a pair of images that tells whether the camera only turned."""
 ENOUGH = 0.95
-"""Part of the images in one model below which the global mapper is tried, too."""
+"""Part of the images in one model below which the global mapper is tried, too. With fixed cameras only it always is:
+the incremental one is often wrong where each camera has one view."""
 BATCH = 16
 """Images, or hundreds of pairs, between two reports of progress."""
 WARNINGS_ONLY = 2
@@ -120,15 +123,15 @@ def match(job: PosesJob, database: Path) -> None:
 
 
 def mapped(job: PosesJob, database: Path, workspace: Path) -> tuple[list[pycolmap.Reconstruction], str]:
-    """The models, the largest first, of the incremental mapper, or of the global one if that makes a larger one."""
+    """The models, the largest first, of the incremental mapper or of the global one, whichever makes the larger one."""
     total = sum(len(camera.names) for camera in job.cameras)
     scratch = workspace / "models"
-    incremental = _incremental(job, database, scratch, total)
-    models, method = incremental, "incremental"
-    if total > 1 and (not incremental or incremental[0].num_reg_images() < ENOUGH * total):
+    models, method = _incremental(job, database, scratch, total), "incremental"
+    size = _size(models[0])[0] if models else 0
+    if total > 1 and (size < ENOUGH * total or all(camera.frames is not None for camera in job.cameras)):
         report("mapping again", 0, total)
         of_global = _global(job, database, scratch)
-        if of_global and (not incremental or of_global[0].num_reg_images() > incremental[0].num_reg_images()):
+        if of_global and (not models or _size(of_global[0]) > _size(models[0])):
             models, method = of_global, "global"
     shutil.rmtree(scratch, ignore_errors=True)
     report("mapping", total, total)
@@ -171,7 +174,24 @@ def _global(job: PosesJob, database: Path, scratch: Path) -> list[pycolmap.Recon
 
 
 def _sorted(models: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    return sorted(models.values(), key=lambda model: (-model.num_reg_images(), model.compute_mean_reprojection_error()))
+    for model in models.values():
+        _drop_impossible(model)
+    return sorted((model for model in models.values() if model.num_reg_images() > 1), key=_size, reverse=True)
+
+
+def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
+    """Images and observations."""
+    return model.num_reg_images(), model.compute_num_observations()
+
+
+def _drop_impossible(model: pycolmap.Reconstruction) -> None:
+    """Take the poses of images whose camera no lens has: the mapper lets a single view of a camera end there."""
+    for image_id in list(model.reg_image_ids()):
+        image = model.image(image_id)
+        camera = model.camera(image.camera_id)
+        focal = camera.mean_focal_length() / max(camera.width, camera.height)
+        if not (FOCALS[0] < focal < FOCALS[1] and abs(camera.params[-1]) < MAX_EXTRA_PARAMETER):
+            model.deregister_frame(image.frame_id)
 
 
 def _color(model: pycolmap.Reconstruction, cameras: Sequence[CameraViews]) -> None:
@@ -185,7 +205,7 @@ def _spread_to_frames(model: pycolmap.Reconstruction, cameras: Sequence[CameraVi
     """Replace the view of each fixed camera by its frames, all with its pose."""
     for camera in cameras:
         image = model.find_image_with_name(camera.names[0])
-        if camera.frames is None or image is None:
+        if camera.frames is None or image is None or not image.has_pose:
             continue
         image.name = camera.frames[0]
         for name in camera.frames[1:]:

@@ -15,9 +15,9 @@ import torch
 from rich.console import Console
 
 from msdgs_export.bake import bake, starting_cameras
+from msdgs_export.cli.export import export_or_import
 from msdgs_export.cli.to_onnx import main as to_onnx
 from msdgs_export.exporters.command import convert
-from msdgs_export.importers.command import model_or_import
 from msdgs_export.jobs.verify import VerificationFailed, verify
 from msdgs_export.layers.graph import GraphBuilder
 from msdgs_export.measure.images import HeldOutImages
@@ -333,16 +333,25 @@ def test_a_folder_is_no_output_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(f"msdgs_export.{name}", work)
     for file_format in ("model", "ply", "deformgs"):
         options = ExportOptions(scene_file.parent / "model.pt", tmp_path, format=file_format)
-        with (
-            pytest.raises(InvalidInput, match="`output` must be a file, not a folder"),
-            model_or_import(options, Console()),
-        ):
-            work()
+        with pytest.raises(InvalidInput, match="`output` must be a file, not a folder"):
+            export_or_import(options, Console())
     monkeypatch.setattr("msdgs_export.exporters.command.DeformationSession", work)
     for suffix in (".ply", ".onnx", ".usdc"):
         (tmp_path / f"out{suffix}").mkdir()
         with pytest.raises(InvalidInput, match="`out` must be a file, not a folder"):
             convert(ConvertOptions(scene_file, tmp_path / f"out{suffix}"), Console())
+
+
+@pytest.mark.parametrize(
+    "value", [{"max_mb": 0.0}, {"tolerance": -1.0}, {"times": 1}, {"plan": "some"}, {"duration": 0.0}]
+)
+def test_values_are_refused_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: dict[str, Any]
+):
+    monkeypatch.setattr("msdgs_export.importers.command.write_model", lambda *_: pytest.fail("it is noticed too late"))
+    (name,) = value
+    with pytest.raises(InvalidInput, match=f"`{name}` must be"):
+        export_or_import(ExportOptions(tmp_path, tmp_path / "a.onnx", "deformgs", **value), Console())
 
 
 def test_two_arrays_of_one_name_are_refused() -> None:

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from msdgs_export.cli.export import export_or_import
 from msdgs_export.exporters.spz import write_spz
 from msdgs_export.importers import command
-from msdgs_export.importers.command import model_or_import
 from msdgs_export.importers.detect import detect_format, frame_files
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.sequence import read_sequence
@@ -44,6 +44,8 @@ from tests.support.splat_files import (
     zipped,
 )
 from tests.support.tolerances import tolerance
+
+QUIET = Console(quiet=True)
 
 REAL = os.environ.get("MSDGS_SPLATS")
 """A folder with real files, if there is one."""
@@ -201,8 +203,8 @@ def test_a_sog_named_by_its_meta_json_is_its_folder(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(command, "read_splats", lambda path, *more: read.append(path) or read_splats(path, *more))
     digests = set()
     for path in (folder, folder / "meta.json"):
-        with model_or_import(ExportOptions(path, tmp_path / "scene.onnx"), Console(quiet=True)):
-            digests.add(DeformationSession(tmp_path / "scene.onnx").scene.metadata.checkpoint_sha256)
+        export_or_import(ExportOptions(path, tmp_path / "scene.onnx"), QUIET)
+        digests.add(DeformationSession(tmp_path / "scene.onnx").scene.metadata.checkpoint_sha256)
     assert read == [folder, folder]
     assert len(digests) == 1
 
@@ -292,19 +294,18 @@ def write_frames(folder: Path, frames: list[Gaussians]) -> Path:
 
 def scene_of(folder: Path, file_format: str = "sequence") -> DeformationSession:
     output = folder.parent / "scene.onnx"
-    with model_or_import(ExportOptions(folder, output, file_format, keep=("float32",)), Console(quiet=True)):
-        return DeformationSession(output)
+    export_or_import(ExportOptions(folder, output, file_format, keep=("float32",)), QUIET)
+    return DeformationSession(output)
 
 
-@pytest.mark.parametrize("option", [{"max_mb": 5.0}, {"plan": "network"}, {"quick": True}, {"keep": ("static",)}])
+@pytest.mark.parametrize(
+    "option", [{"max_mb": 5.0}, {"for_web": True}, {"plan": "network"}, {"quick": True}, {"keep": ("static",)}]
+)
 def test_options_of_trained_models_are_refused_for_splats(tmp_path: Path, option: dict[str, Any]):
     splats = write(tmp_path, "a.ply", ply_bytes(inria_columns(some_gaussians(20, 0))))
     (name,) = option
-    with (
-        pytest.raises(InvalidInput, match=f"`{name}` must be left out"),
-        model_or_import(ExportOptions(splats, **option), Console(quiet=True)),
-    ):
-        pass
+    with pytest.raises(InvalidInput, match=f"`{name}` must be left out"):
+        export_or_import(ExportOptions(splats, **option), QUIET)
     assert not splats.with_suffix(".onnx").exists()
 
 

@@ -13,7 +13,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from msdgs_export.importers.command import model_or_import
+from msdgs_export.cli.export import export_or_import
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.runs.model import RUNS, write_model
 from msdgs_export.importers.splats.formats import read_splats
@@ -74,8 +74,8 @@ def frames(folder: Path, g: Gaussians) -> list[Path]:
 
 
 def read_frames(folder: Path, files: list[Path]) -> Gaussians:
-    with model_or_import(ExportOptions(folder, folder / "scene.onnx", "sequence", keep=("float32",)), QUIET):
-        return DeformationSession(folder / "scene.onnx").gaussians(0.5)
+    export_or_import(ExportOptions(folder, folder / "scene.onnx", "sequence", keep=("float32",)), QUIET)
+    return DeformationSession(folder / "scene.onnx").gaussians(0.5)
 
 
 def run_of(kind: str, write_run: Callable[..., Path], state: dict[str, torch.Tensor]) -> Kind:

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from msdgs_export.bake import bake
+from msdgs_export.cli.export import export_or_import
 from msdgs_export.cli.to_onnx import main as to_onnx
-from msdgs_export.importers.command import model_or_import
 from msdgs_export.importers.detect import detect_format
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.runs import base
@@ -274,11 +274,8 @@ def test_the_width_of_images_is_that_of_the_runs_cameras(tmp_path: Path, has_cam
 def test_images_of_another_world_are_refused(tmp_path: Path):
     run = foreign.write_fourdgs(tmp_path / "run", foreign.fourdgs_state((1,)))
     (tmp_path / "dataset.json").write_text("{}")
-    with (
-        pytest.raises(InvalidInput, match="unscaled coordinates"),
-        model_or_import(ExportOptions(run, data=tmp_path), QUIET),
-    ):
-        pass
+    with pytest.raises(InvalidInput, match="unscaled coordinates"):
+        export_or_import(ExportOptions(run, data=tmp_path), QUIET)
 
 
 def network_of(run: Path) -> Path:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from msdgs_export.cli.export import export_or_import
 from msdgs_export.exporters.command import convert
-from msdgs_export.importers.command import model_or_import
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.polynomial import polynomial_scene
 from msdgs_export.importers.sequence import read_sequence
@@ -61,8 +61,7 @@ def test_the_scene_follows_the_published_equations(tmp_path: Path, t: float):
 @pytest.mark.slow
 def test_the_imported_file_is_compared_with_the_equations_and_can_be_converted(tmp_path: Path):
     options = ExportOptions(write(tmp_path, columns()), tmp_path / "a.onnx", duration=2.0, keep=("float32",))
-    with model_or_import(options, QUIET):
-        pass
+    export_or_import(options, QUIET)
     metadata = DeformationSession(tmp_path / "a.onnx").scene.metadata
     assert (metadata.plan, metadata.contract) == ("polynomial", "msdgs/2")
     errors = [metadata.measured_error[name] for name in ("means", "quats", "scales", "opacities")]

@@ -8,9 +8,9 @@ import pytest
 import tyro
 from rich.console import Console
 
+from msdgs_export.cli.export import export_or_import
 from msdgs_export.exporters.gltf import write_gltf
 from msdgs_export.exporters.upright import upright
-from msdgs_export.importers.command import model_or_import
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.scene import static_scene
 from msdgs_export.importers.sequence import read_sequence, sequence_scene
@@ -24,6 +24,7 @@ from msdgs_serve.framing import framing
 from msdgs_serve.scene.errors import InvalidInput
 from tests.support.splat_files import compressed_ply_bytes, inria_columns, ply_bytes, some_gaussians, write_splats
 
+QUIET = Console(quiet=True)
 G = some_gaussians(20, 0)
 TILTED = (0.1, -0.9, 0.3)
 
@@ -107,11 +108,8 @@ POISON = ["", "w", "--z", "xy", "0 0 0", "1 2", "1 2 3 4", "nan 0 1", "inf 0 0",
 def test_no_other_text_is_a_direction(tmp_path: Path, text: str):
     assert up_direction(text) is None
     file = write_splats(tmp_path, "ply", G)
-    with (
-        pytest.raises(InvalidInput, match=r"`up` must be x, y, z, -x, -y, -z or three finite numbers"),
-        model_or_import(ExportOptions(file, up=text), Console(quiet=True)),
-    ):
-        pass
+    with pytest.raises(InvalidInput, match=r"`up` must be x, y, z, -x, -y, -z or three finite numbers"):
+        export_or_import(ExportOptions(file, up=text), QUIET)
     assert not file.with_suffix(".onnx").exists()
 
 
@@ -184,8 +182,8 @@ def test_the_option_goes_before_what_the_file_says(tmp_path: Path, kind: str):
         path = write_splats(tmp_path, kind, G)
         if kind == "ply":
             path.write_bytes(headed("Vertical Axis: z"))
-    with model_or_import(ExportOptions(path, tmp_path / "a.onnx", **given), Console(quiet=True)):
-        found = framing(DeformationSession(tmp_path / "a.onnx").scene.metadata).up
+    export_or_import(ExportOptions(path, tmp_path / "a.onnx", **given), QUIET)
+    found = framing(DeformationSession(tmp_path / "a.onnx").scene.metadata).up
     np.testing.assert_allclose(found, unit(*TILTED), atol=1e-9)
 
 
@@ -196,8 +194,5 @@ def test_frames_that_differ_in_what_is_up_are_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("file_format", ["model", "deformgs", "4dgs"])
 def test_trained_models_have_no_such_option(tmp_path: Path, file_format: str):
-    with (
-        pytest.raises(InvalidInput, match=r"`up` must be left out: it is for splats"),
-        model_or_import(ExportOptions(tmp_path, tmp_path / "a.onnx", file_format, up="z"), Console(quiet=True)),
-    ):
-        pass
+    with pytest.raises(InvalidInput, match=r"`up` must be left out: it is for splats"):
+        export_or_import(ExportOptions(tmp_path, tmp_path / "a.onnx", file_format, up="z"), QUIET)

@@ -242,6 +242,13 @@ def test_invalid_options_are_refused_by_name(
     assert not (tmp_path / "s.onnx").exists()
 
 
+def test_for_web_is_a_limit_of_bytes_and_an_error():
+    model = Path("model.pt")
+    assert ExportOptions(model, for_web=True).spelled_out == ExportOptions(model, max_mb=5.0, min_psnr=40.0)
+    own = ExportOptions(model, max_mb=2.0, min_psnr=45.0)
+    assert replace(own, for_web=True).spelled_out == own == own.spelled_out
+
+
 @pytest.mark.parametrize(("plan", "keep"), [(None, ()), ("network", ()), ("network", ("float32",))])
 def test_a_limit_of_bytes_is_kept_with_the_error_that_the_file_says(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], plan: str | None, keep: tuple[Kept, ...]

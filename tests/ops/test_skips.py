@@ -13,5 +13,6 @@ def test_one_line_names_untested_parts_and_the_command_to_install_them():
     assert not_tested(list(ALLOWED_SKIPS)) == ""
     line = not_tested([lack.reason for lack in (*LACKS, LACKS[0])])
     assert "the page in a browser (2), " in line
-    install = "apt-get install chromium libatomic1 nginx-light prometheus strace && pip install kubernetes-validate"
-    assert line.endswith(f"{install} && make tests/export/node/node_modules")
+    programs = "chromium libatomic1 nginx-light prometheus strace firefox-esr xvfb libegl1 libgl1-mesa-dri"
+    makes = "tests/export/runtime/node_modules tests/export/node/node_modules"
+    assert line.endswith(f"apt-get install {programs} && pip install kubernetes-validate && make {makes}")

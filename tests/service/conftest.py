@@ -7,11 +7,10 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from tests.support.pages import MILLISECONDS, watched_page
 from tests.support.processes import chromium, wait_until_still
 from tests.support.service import serving
 
-MILLISECONDS = 60_000
-"""Maximum wait for something on a page."""
 expect.set_options(timeout=MILLISECONDS)
 
 
@@ -32,15 +31,9 @@ def modules(browser: Browser, scene: Path) -> Iterator[Page]:
 
 @pytest.fixture
 def page(browser: Browser) -> Iterator[Page]:
-    """Yield an empty page; fail if its console shows an error other than a request that found no service."""
-    with browser.new_context(viewport={"width": 820, "height": 420}, reduced_motion="reduce") as context:
-        page = context.new_page()
-        page.set_default_timeout(MILLISECONDS)
-        complaints: list[str] = []
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", lambda line: complaints.append(line.text) if line.type in ("error", "warning") else None)
+    """An empty page; fails if its console shows an error other than a request that found no service."""
+    with watched_page(browser, reduced_motion="reduce") as page:
         yield page
-        assert [text for text in complaints if not text.startswith("Failed to load resource")] == []
 
 
 def open_page(page: Page, client: httpx.Client, address: str = "#scene=balls") -> Page:

@@ -8,14 +8,14 @@ import pytest
 
 from msdgs_serve.api.downloads import SceneFileResponse
 from msdgs_serve.api.methods import METHODS
-from msdgs_serve.api.routes.viewer import FILES
+from msdgs_serve.browser import viewer_files
 from tests.support.scene_files import write_scene
 from tests.support.service import check_problem, in_this_process, serving
 
 SHA256 = "0" * 64  # of the model of the test's scenes
 FRAME = "/render?width=8&height=8"
 GET_PATHS = [
-    *("/", *(f"/viewer/{name}" for name in FILES), "/viewer/nothing", "/nothing", "/scenes/", "/docs/?a=1"),
+    *("/", *(f"/viewer/{name}" for name in viewer_files()), "/viewer/nothing", "/nothing", "/scenes/", "/docs/?a=1"),
     *("/docs", "/redoc", "/openapi.json", "/static-offline-docs/swagger-ui.css", "/static-offline-docs/nothing"),
     *("/live", "/ready", "/scenes", "/scenes/balls", "/scenes/none", "/scenes/balls/report", "/scenes/balls/file"),
     *(FRAME, f"{FRAME}&format=npy", "/render?t=7", "/render?t=x", "/scenes/%00"),
@@ -25,7 +25,7 @@ ALLOW = {
     "/docs": "GET, HEAD, OPTIONS",
     "/openapi.json": "GET, HEAD, OPTIONS",
     "/static-offline-docs/swagger-ui.css": "GET, HEAD, OPTIONS",
-    "/viewer/main.js": "GET, HEAD, OPTIONS",
+    "/viewer/service/main.js": "GET, HEAD, OPTIONS",
     "/live": "GET, HEAD, OPTIONS",
     "/metrics": "GET, HEAD, OPTIONS",
     "/render": "GET, HEAD, POST, OPTIONS",

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, Route
 
-from msdgs_serve.api.routes.viewer import FILES, FOLDER
+from msdgs_serve.browser import VIEWER, viewer_files
 from msdgs_serve.imaging import ImageFormat
 from tests.service.conftest import MILLISECONDS, open_page
 from tests.support.images import decode
@@ -69,7 +69,7 @@ def test_only_its_own_files_may_be_loaded(client: httpx.Client):
     for name in ("../index.html", "..%2F__init__.py", "nothing.js", "%2Fetc%2Fpasswd"):
         assert client.get(f"/viewer/{name}").status_code == 404
     assert not re.search(r"https?://", page.text), "something from elsewhere"
-    assert {path.name for path in FOLDER.iterdir()} == set(FILES)
+    assert {str(path.relative_to(VIEWER)) for path in VIEWER.rglob("*") if path.is_file()} == set(viewer_files())
 
 
 def test_it_shows_the_scene_as_the_service_draws_it(opened: Page, client: httpx.Client):

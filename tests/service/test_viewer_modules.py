@@ -78,7 +78,7 @@ def test_times_are_distinct_in_range_and_exact_at_both_ends(modules: Page, first
 def test_motion_ends_within_the_range_of_times(modules: Page, first: float, last: float):
     script = """async (range) => {
         const { Player } = await import("/viewer/player.js");
-        const { frameBody } = await import("/viewer/request.js");
+        const { frameBody } = await import("/viewer/service/request.js");
         const player = new Player();
         player.range = range;
         player.seek(1);
@@ -92,7 +92,7 @@ def test_motion_ends_within_the_range_of_times(modules: Page, first: float, last
 @pytest.mark.parametrize(("pose", "nanoseconds_per_pixel"), [(0.002, 20.0), (0.02, 100.0), (0.02, 1000.0)])
 def test_moving_frames_come_15_times_per_second(modules: Page, pose: float, nanoseconds_per_pixel: float):
     script = """async ([pose, aPixel]) => {
-        const { Pace } = await import("/viewer/pace.js");
+        const { Pace } = await import("/viewer/service/pace.js");
         const pace = new Pace();
         const taken = [];
         for (let i = 0; i < 20; i += 1) {
@@ -115,8 +115,8 @@ def test_slow_moving_frames_become_small_and_are_shown(
 ):
     """The clock is simulated: at first a frame of 600 x 400 pixels takes at least 0.6 s."""
     script = """async ([pose, aPixel]) => {
-        const { Frames } = await import("/viewer/frames.js");
-        const { Pace } = await import("/viewer/pace.js");
+        const { Frames } = await import("/viewer/service/frames.js");
+        const { Pace } = await import("/viewer/service/pace.js");
         window.taken = [];
         window.createImageBitmap = async () => ({ close() {} });
         window.fetch = (_, { body, signal }) => new Promise((answer, reject) => {
@@ -151,8 +151,8 @@ def test_slow_moving_frames_become_small_and_are_shown(
 def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modules: Page, page: Page):
     """The clock is simulated: a frame takes 20 ms on the service and 30 ms on its way."""
     script = """async () => {
-        const { Frames } = await import("/viewer/frames.js");
-        const { Pace } = await import("/viewer/pace.js");
+        const { Frames } = await import("/viewer/service/frames.js");
+        const { Pace } = await import("/viewer/service/pace.js");
         Object.assign(window, { asked: [], shown: [], playing: true, t: 0, most: 0 });
         window.createImageBitmap = async () => ({ close() {} });
         let inFlight = 0;
@@ -190,8 +190,8 @@ def test_playback_asks_for_30_frames_per_second_of_which_two_are_in_flight(modul
 
 def test_a_frame_that_was_overtaken_is_not_shown(modules: Page, page: Page):
     script = """async () => {
-        const { Frames } = await import("/viewer/frames.js");
-        const { Pace } = await import("/viewer/pace.js");
+        const { Frames } = await import("/viewer/service/frames.js");
+        const { Pace } = await import("/viewer/service/pace.js");
         const answers = [];
         const shown = [];
         window.createImageBitmap = async (blob) => ({ blob, close() {} });

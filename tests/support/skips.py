@@ -35,6 +35,12 @@ LACKS = (
     Lack("there is no prometheus to run", "the dashboard's queries", debian="prometheus"),
     Lack("needs strace", "which files native code opens", debian="strace"),
     Lack("kubernetes-validate isn't installed", "the Kubernetes manifests", python="kubernetes-validate"),
+    Lack("no Firefox with a display", "a scene in Firefox", debian="firefox-esr xvfb libegl1 libgl1-mesa-dri"),
+    Lack(
+        "no tests/export/runtime/node_modules",
+        "scenes that a browser draws",
+        make="tests/export/runtime/node_modules",
+    ),
     Lack("no tests/export/node/node_modules", "written files in other programs", make="tests/export/node/node_modules"),
 )
 

@@ -22,18 +22,10 @@ from msdgs_serve.api.frames import IfNoneMatch, is_unchanged
 from msdgs_serve.api.keys import CLIENT
 from msdgs_serve.api.numbers import Name
 from msdgs_serve.api.openapi import FILE_RESPONSE, NOT_MODIFIED, SCENE_BODY, problems
-from msdgs_serve.api.schemas import (
-    GaussianCounts,
-    GraphCost,
-    Placement,
-    SceneAdded,
-    SceneDetail,
-    SceneEntry,
-    SceneList,
-    SceneView,
-)
+from msdgs_serve.api.schemas import GraphCost, SceneAdded, SceneDetail, SceneEntry, SceneList
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.uploads import Stored
+from msdgs_serve.description import described
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene_report import read_report, report_path
 from msdgs_serve.store import SceneStatus, SceneStore
@@ -191,24 +183,12 @@ async def _parts(request: Request, seconds: float) -> AsyncIterator[bytes]:
 
 def _describe(store: SceneStore, name: str) -> SceneDetail:
     served, status = store.get(name), store.status(name)
-    scene, metadata, seen = served.session.scene, served.metadata, served.framing
-    counts = GaussianCounts(moving=scene.moving_count, static=scene.static_count, total=len(scene))
     return SceneDetail(
-        **vars(metadata)
-        | {
-            "cameras": [camera.to_plain() for camera in metadata.cameras],
-            "scene_to_world": Placement(**scene.metadata.scene_to_world.to_plain()),
-        },
+        **described(served.session, served.metadata, served.framing),
         **_problem(status),
         name=name,
         loaded=status.loaded,
-        steps=served.session.max_steps,
-        gaussians=counts,
-        changes=scene.changes,
-        motion=scene.has_motion,
-        view=SceneView(**vars(seen) | {"target": seen.target.tolist(), "up": seen.up.tolist()}),
         report=report_path(store.file(name)).is_file(),
-        sha256=served.sha256,
         cost=GraphCost.model_validate(served.session.cost, from_attributes=True),
     )
 

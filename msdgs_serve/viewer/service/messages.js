@@ -12,8 +12,3 @@ export function noScene(name) {
 }
 
 export const sceneGone = (name) => `${name} is gone. This is its last frame; other scenes are in the list.`;
-
-export function noView(view) {
-  if (view === "motion") return "Nothing moves in this scene that could be shown as motion: this is its color.";
-  return "The link asks for a view that doesn’t exist: this is the color.";
-}

@@ -6,9 +6,15 @@ import { Refusal, received, render } from "./api.js";
 const FULL_AFTER = 150; // milliseconds
 const SHRINK = 0.5; // factor on the number of pixels if the service rejects it as too large
 const MIN_PIXELS = 64 * 64;
+const STAGES = ["pose", "draw", "encode"]; // of the service, that are told
 const MAX_REQUESTS = 2; // in flight during playback: the next one hides the way to the service
 
+/** The source of pixels that the service is. */
 export class Frames {
+  label = "drawn by the service";
+  views = ["rgb", "depth", "motion", "gaussians"];
+  isSmooth = false;
+
   /**
    * `host` has: size() of a full frame in pixels; body(); isPlaying(); isMoving(), by itself or by playback;
    * show(bitmap, facts); failed(error).
@@ -25,6 +31,12 @@ export class Frames {
     this.timer = 0;
     this.paused = true; // until the scene is opened
     this.refused = false; // whether the service refused the last request; the next one waits for a change
+  }
+
+  /** Show the scene that is open now. */
+  async open() {
+    this.paused = false;
+    this.change({ cut: true });
   }
 
   /** The view has changed. `cut`: frames in progress are useless. */
@@ -50,6 +62,10 @@ export class Frames {
 
   get isBusy() {
     return this.inFlight.size > 0;
+  }
+
+  get isIdle() {
+    return (this.shown || this.paused || this.refused) && !this.isBusy;
   }
 
   /** Width and height of a frame in full quality. */
@@ -119,7 +135,8 @@ export class Frames {
     const stages = timings(response.headers.get("Server-Timing"));
     const { queue = 0, draw = 0, encode = 0 } = stages;
     if (!full) this.pace.measured(pixels, seconds - queue, draw + encode);
-    this.host.show(bitmap, { ...size, full, seconds, stages, isNews });
+    const told = Object.fromEntries(STAGES.map((name) => [name, stages[name] ?? 0]));
+    this.host.show(bitmap, { ...size, full, seconds, stages: told, isNews });
     bitmap.close();
     this.refused = false;
     if (full && !this.wanted) this.shown = { etag: response.headers.get("ETag") };

@@ -1,5 +1,6 @@
 // Connection state: a banner while the service doesn't answer, and reconnection.
 
+import { say } from "../banner.js";
 import { Refusal, call } from "./api.js";
 
 const SHORTEST_WAIT = 1000;
@@ -7,9 +8,8 @@ const MAX_WAIT = 5000;
 const GROWTH = 1.5;
 
 export class Connection {
-  /** `banner` is an element; `recovered` is called when the service answers again, `keyNeeded` when it needs a key. */
-  constructor(banner, { recovered, keyNeeded }) {
-    this.banner = banner;
+  /** `recovered` is called when the service answers again, `keyNeeded` when it needs a key. */
+  constructor({ recovered, keyNeeded }) {
     this.recovered = recovered;
     this.keyNeeded = keyNeeded;
     this.isLost = false;
@@ -20,18 +20,13 @@ export class Connection {
   failed(error) {
     if (error.retryAfter) this.#lose(error.message, error.retryAfter * 1000);
     else if (error instanceof Refusal && error.status === 401) {
-      this.say("The service asks for a key.");
+      say("The service asks for a key.");
       this.keyNeeded();
-    } else this.say(error.message);
-  }
-
-  say(text) {
-    if (this.banner.textContent !== text) this.banner.textContent = text; // else it is read aloud again
-    this.banner.hidden = !text;
+    } else say(error.message);
   }
 
   #lose(text, wait) {
-    this.say(text);
+    say(text);
     if (this.isLost) return;
     this.isLost = true;
     this.#tryAfter(Math.max(wait, SHORTEST_WAIT));
@@ -46,12 +41,12 @@ export class Connection {
     try {
       await call("ready");
     } catch (error) {
-      this.say(error.message);
+      say(error.message);
       this.#tryAfter(Math.min(wait * GROWTH, MAX_WAIT));
       return;
     }
     this.isLost = false;
-    this.say("");
+    say("");
     this.recovered();
   }
 }

@@ -1,6 +1,6 @@
 // The work-precision diagram of a report: milliseconds on the x axis, PSNR of the worst frame on the y axis.
 
-import { decibels, duration, size } from "./numbers.js";
+import { decibels, duration, size } from "../numbers.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const WIDTH = 320;

@@ -1,6 +1,6 @@
 // Bodies of POST /render for the current view.
 
-import { depthRange } from "./camera.js";
+import { depthRange } from "../camera.js";
 
 const MOTION_SHARE = 1 / 50; // dt of the motion channel, as a fraction of the time range
 

@@ -1,0 +1,156 @@
+"""Writing a site: a folder with the page, the viewer, onnxruntime-web, the scene and their licenses."""
+
+import gzip
+import json
+import os
+import shlex
+from importlib.metadata import distribution
+from pathlib import Path
+
+from rich.console import Console
+
+from msdgs_export.exporters.site.page import PREVIEW, PREVIEW_SIZE, PageText, folder_url, iframe, site_page
+from msdgs_export.exporters.site.runtime import site_runtime
+from msdgs_export.options import WEB_MB, ConvertOptions
+from msdgs_serve.browser import PAGE, RUNTIME, viewer_files
+from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.description import described
+from msdgs_serve.framing import framing
+from msdgs_serve.imaging import encode
+from msdgs_serve.renderer import Renderer
+from msdgs_serve.scene.camera import Camera, orbit
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.writing import temporary_folder
+
+FORMAT = "msdgs-site/1"
+DESCRIPTION = "scene.json"
+SERVICE = "service/"
+"""The part of the viewer that needs the service."""
+AZIMUTH, ELEVATION = 30.0, 20.0
+"""Of the view that the page opens with, degrees."""
+MIN_SAVED = 0.1
+"""Part of the scene's bytes that gzip has to save: browsers take time to unpack it."""
+LICENSE = "LICENSE.txt"
+
+
+def write_site(session: DeformationSession, options: ConvertOptions, console: Console) -> None:
+    """Write the folder `options.out`, whole or not at all, and print how to look at it.
+
+    Raises `InvalidInput` for an address that isn't one and for a folder that holds anything but a site,
+    `RuntimeMissing` and `WriteFailed`.
+    """
+    out = options.out
+    if options.t is not None:
+        raise InvalidInput("t", "left out for a site, which shows all times", options.t)
+    text = _text(session, options)
+    _check_replaceable(out)
+    files = _files(session, options, text, site_runtime(options.onnxruntime_web, console))
+    parent = out.absolute().parent
+    parent.mkdir(parents=True, exist_ok=True)
+    with temporary_folder(parent, out) as folder:
+        new, old = folder / "new", folder / "old"
+        for path, contents in files.items():
+            (new / path).parent.mkdir(parents=True, exist_ok=True)
+            (new / path).write_bytes(contents)
+        if out.is_dir():
+            os.replace(out, old)
+        try:
+            os.replace(new, out)
+        except BaseException:
+            if old.is_dir():
+                os.replace(old, out)
+            raise
+    _tell(out, text, files, console)
+
+
+def _text(session: DeformationSession, options: ConvertOptions) -> PageText:
+    title = _printable(options.title or options.scene.stem)
+    moves = "A moving scene" if session.scene.changes else "A scene"
+    description = f"{moves} of {len(session.scene):,} Gaussians, to look at from all sides."
+    url = None if options.url is None else folder_url(options.url)
+    return PageText(title, _printable(options.description or description), url)
+
+
+def _printable(text: str) -> str:
+    """Text in which bytes of file names that are no text are replaced."""
+    return text.encode("utf-8", "replace").decode()
+
+
+def _check_replaceable(out: Path) -> None:
+    """Raise `InvalidInput` if `out` is a file, or a folder with anything but a site."""
+    if out.exists() and not out.is_dir():
+        raise InvalidInput("out", "a folder", str(out))
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    try:
+        written = set(json.loads((out / DESCRIPTION).read_text())["files"])
+    except (OSError, ValueError, LookupError, TypeError):
+        raise InvalidInput("out", "a new folder, or one that holds a site", f"{out}, which holds other files") from None
+    others = sorted(
+        path.relative_to(out).as_posix()
+        for path in out.rglob("*")
+        if path.is_file() and path.relative_to(out).as_posix() not in written
+    )
+    if others:
+        found = f"{out}, which also holds {', '.join(others[:3])}"
+        raise InvalidInput("out", "a new folder, or one that holds nothing but a site", found)
+
+
+def _files(
+    session: DeformationSession, options: ConvertOptions, text: PageText, runtime: dict[str, bytes]
+) -> dict[str, bytes]:
+    """The contents of all files by their paths."""
+    viewer = viewer_files()
+    page = site_page(viewer.pop(PAGE).decode(), text)
+    scene = options.scene.read_bytes()
+    packed = gzip.compress(scene, mtime=0)
+    is_smaller = len(packed) <= (1 - MIN_SAVED) * len(scene)
+    stored_name, stored = ("scene.onnx.gz", packed) if is_smaller else ("scene.onnx", scene)
+    files = {
+        PAGE: page.encode(),
+        PREVIEW: _preview(session),
+        stored_name: stored,
+        LICENSE: _license(),
+        **{f"viewer/{path}": contents for path, contents in viewer.items() if not path.startswith(SERVICE)},
+        **{f"{RUNTIME}/{name}": contents for name, contents in runtime.items()},
+    }
+    metadata = session.scene.metadata
+    description = {
+        "format": FORMAT,
+        "name": _printable(options.scene.stem),
+        "file": {"path": stored_name, "size": len(scene), "stored": len(stored)},
+        **described(session, metadata.in_world(), framing(metadata)),
+        "files": [*files, DESCRIPTION],
+    }
+    return files | {DESCRIPTION: json.dumps(description).encode()}
+
+
+def _preview(session: DeformationSession) -> bytes:
+    """The view that the page opens with, as a JPEG."""
+    metadata = session.scene.metadata
+    view = framing(metadata)
+    pose = orbit(view.target, view.distance, AZIMUTH, ELEVATION, view.up)
+    camera = Camera.from_fov(pose, *PREVIEW_SIZE, view.fov_y)
+    return encode(Renderer().render(session, camera, metadata.time_range[0]), "jpeg")
+
+
+def _license() -> bytes:
+    """The license of this package, which the viewer's files are under."""
+    text = distribution("msdgs").read_text("licenses/LICENSE")
+    assert text is not None
+    return text.encode()
+
+
+def _tell(out: Path, text: PageText, files: dict[str, bytes], console: Console) -> None:
+    scene = next(len(contents) for path, contents in files.items() if path.startswith("scene.onnx"))
+    size = sum(map(len, files.values()))
+    lines = [
+        f"{out}: {len(files)} files, {size / 1e6:.1f} MB, of which the scene has {scene / 1e6:.1f} MB",
+        f"to look at it: python -m http.server -d {shlex.quote(str(out))}",
+        "then open http://localhost:8000",
+        f"to show it in another page: {iframe(text, out.name)}",
+    ]
+    if scene > 1e6 * WEB_MB:
+        lines.append("msdgs-export --for-web writes a scene with fewer bytes")
+    for line in lines:
+        console.print(line, markup=False)

@@ -1,0 +1,8 @@
+// The line about what is wrong.
+
+/** Say what is wrong; nothing if `text` is empty. */
+export function say(text) {
+  const banner = document.getElementById("banner");
+  if (banner.textContent !== text) banner.textContent = text; // else it is read aloud again
+  banner.hidden = !text;
+}

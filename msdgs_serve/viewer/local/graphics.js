@@ -1,0 +1,133 @@
+// The WebGL2 resources of a scene, and one frame of it.
+
+import {
+  BATCH, BLEND_FRAGMENT, BLEND_VERTEX, EVERYWHERE, MOVING, ROW_BITS, STILL, projectShader, samplersOf,
+} from "./shaders.js"; // prettier-ignore
+import { Texels, program, quadIndices, target } from "./webgl.js";
+
+const CHANNELS = ["rgb", "alpha", "depth"];
+const SLOTS = 3; // poses: two that are shown, and the next
+const CONTEXT = { alpha: false, antialias: false, depth: false, stencil: false, powerPreference: "high-performance" };
+
+export class Graphics {
+  /** `scene` has metadata, moving, gaussians, changing. Throws an Error without WebGL2. */
+  constructor(canvas, scene) {
+    this.canvas = canvas;
+    this.scene = scene;
+    this.gl = canvas.getContext("webgl2", CONTEXT);
+    if (!this.gl) throw new Error("This browser doesn’t draw with WebGL2, or it is switched off.");
+    this.restore();
+  }
+
+  get isLost() {
+    return this.gl.isContextLost();
+  }
+
+  /** Make all resources, at first and after a lost context; the arrays have to be set again. */
+  restore() {
+    const { gl, scene } = this;
+    const posed = [...MOVING, ...scene.changing];
+    this.found = 0; // Gaussians that are drawn
+    this.project = program(gl, EVERYWHERE, projectShader({ degree: scene.metadata.sh_degree, posed }));
+    this.blend = program(gl, BLEND_VERTEX, BLEND_FRAGMENT);
+    const textures = (names) => Object.fromEntries(names.map((name) => [name, new Texels(gl, name)]));
+    this.order = new Texels(gl, "order");
+    this.still = textures(STILL);
+    this.poses = Array.from({ length: SLOTS }, () => textures(posed));
+    this.project.setUnits(samplersOf(posed));
+    this.blend.setUnits(["placed", "painted"]);
+    const rows = Math.max(Math.ceil(scene.gaussians / (1 << ROW_BITS)), 1);
+    this.splats = target(gl, [gl.RGBA32UI, gl.RGBA32UI], 1 << ROW_BITS, rows);
+    this.quads = quadIndices(gl, BATCH);
+    // 8 bits lose faint splats
+    this.format = gl.getExtension("EXT_color_buffer_float") ? gl.RGBA16F : gl.RGBA8;
+    this.frame = null;
+  }
+
+  /** Set what doesn't depend on time, arrays by name. */
+  setConstants(arrays) {
+    for (const name of STILL) this.still[name].write(arrays[name]);
+  }
+
+  /** Set the arrays of a pose. */
+  setPose(slot, arrays) {
+    for (const [name, array] of Object.entries(arrays)) this.poses[slot][name].write(array);
+  }
+
+  /** Set the order in which Gaussians are blended: their ids, the first `found` of an array. */
+  setOrder(order, found) {
+    this.order.write(order);
+    this.found = found;
+  }
+
+  /** Draw a view from `viewOf`, of poses in two slots and the share of the way between them. */
+  draw(view, { first, second, share }, channel) {
+    const { gl, canvas } = this;
+    const { width, height } = view;
+    if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
+    gl.disable(gl.BLEND);
+    this.#project(view, this.poses[first.slot], this.poses[second.slot], share, channel);
+    if (this.frame?.width !== width || this.frame?.height !== height) {
+      this.frame?.remove();
+      this.frame = target(gl, [this.format], width, height);
+    }
+    this.#blend(channel === "rgb" ? this.scene.metadata.background : [0, 0, 0]);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, null);
+    gl.blitFramebuffer(0, 0, width, height, 0, 0, width, height, gl.COLOR_BUFFER_BIT, gl.NEAREST);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+  }
+
+  #project(view, before, after, share, channel) {
+    const { gl, project, scene, found } = this;
+    const { metadata } = scene;
+    project.use();
+    gl.uniform1i(project.at("found"), found);
+    gl.uniform1i(project.at("moving"), scene.moving);
+    gl.uniform1f(project.at("share"), share);
+    gl.uniformMatrix3fv(project.at("rotation"), true, view.rotation.flat());
+    gl.uniform3fv(project.at("eye"), view.eye);
+    gl.uniform2f(project.at("focal"), view.fx, view.fy);
+    gl.uniform2f(project.at("principal"), view.cx, view.cy);
+    gl.uniform2f(project.at("size"), view.width, view.height);
+    gl.uniform4fv(project.at("limits"), view.limits);
+    gl.uniform1f(project.at("eps2d"), metadata.eps2d);
+    gl.uniform1i(project.at("mip"), metadata.antialiasing === "mip");
+    gl.uniform1i(project.at("channel"), CHANNELS.indexOf(channel));
+    gl.uniform2fv(project.at("depths"), view.depths);
+    const posed = Object.keys(before).flatMap((name) => [before[name], after[name]]);
+    project.bind([this.order, ...Object.values(this.still), ...posed].map(({ texture }) => texture));
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.splats.framebuffer);
+    gl.viewport(0, 0, this.splats.width, Math.max(Math.ceil(found / this.splats.width), 1));
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  #blend([red, green, blue]) {
+    const { gl, blend, frame, found } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, frame.framebuffer);
+    gl.viewport(0, 0, frame.width, frame.height);
+    gl.clearColor(red, green, blue, 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (!found) return;
+    blend.use();
+    gl.uniform2f(blend.at("size"), frame.width, frame.height);
+    gl.uniform1i(blend.at("found"), found);
+    blend.bind(this.splats.textures);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.quads);
+    const batches = Math.ceil(found / BATCH);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * Math.min(found, BATCH), gl.UNSIGNED_SHORT, 0, batches);
+  }
+
+  /** The pixels of the frame that was drawn in this task. */
+  read() {
+    const { width, height } = this.canvas;
+    const copy = new OffscreenCanvas(width, height).getContext("2d");
+    copy.drawImage(this.canvas, 0, 0); // reading from WebGL would stall it
+    return copy.getImageData(0, 0, width, height);
+  }
+
+  dispose() {
+    this.gl.getExtension("WEBGL_lose_context")?.loseContext();
+  }
+}

@@ -1,0 +1,45 @@
+// The page of a folder of files: one scene, which is drawn here.
+
+import { say } from "../banner.js";
+import { Exports } from "../exports.js";
+import { LocalSource } from "../local/source.js";
+import { fromHash, linkTo } from "../share.js";
+import { Viewer } from "../viewer.js";
+import { description, sceneFile } from "./files.js";
+
+const RUNTIME = "onnxruntime-web/";
+const IS_CALM = matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+const viewer = new Viewer({ shown: () => document.getElementById("preview")?.remove() });
+const source = new LocalSource(viewer, { runtime: RUNTIME, file: sceneFile });
+viewer.use(source);
+
+async function start() {
+  const look = fromHash(location.hash);
+  const scene = await description();
+  await viewer.open(scene, look);
+  if (scene.changes && look.t === null && !IS_CALM) viewer.timeline.toggle();
+}
+
+async function guarded(action) {
+  try {
+    await action();
+  } catch (error) {
+    say(error.message);
+  }
+}
+
+/** The functions of Exports. */
+const takes = {
+  link: () => linkTo(viewer),
+  png: async () => {
+    viewer.pause();
+    return { contents: await source.png(), name: `${viewer.scene.name}-${viewer.player.t}.png` };
+  },
+  onnx: async () => ({ contents: new Blob([await sceneFile(viewer.scene)]), name: `${viewer.scene.name}.onnx` }),
+};
+
+document.body.classList.toggle("embedded", window.parent !== window);
+new Exports(takes, (action) => viewer.scene && guarded(action));
+window.addEventListener("hashchange", () => viewer.scene && guarded(() => viewer.open(viewer.scene, fromHash(location.hash))));
+guarded(start);

@@ -1,0 +1,104 @@
+"""A site in Chromium: it plays, draws what the service draws, and does nothing while nothing changes."""
+
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from tests.support.pages import watched_page
+from tests.support.processes import forget, wait_until_still
+from tests.support.sites import drawn_by_the_service, needs_runtime, picture, psnr
+from tests.support.tolerances import tolerance
+
+pytestmark = [pytest.mark.slow, needs_runtime]
+
+COUNT_WORK = """() => {
+    window.work = 0;
+    const counted = (holder, name) => {
+        const call = holder[name];
+        holder[name] = function (...values) { window.work += 1; return call.apply(this, values); };
+    };
+    counted(window, "requestAnimationFrame");
+    counted(Worker.prototype, "postMessage");
+    counted(WebGL2RenderingContext.prototype, "drawArraysInstanced");
+}"""
+"""Counts what a page does by itself: animation frames, messages to workers and draw calls."""
+HIDE = """(isHidden) => {
+    Object.defineProperty(document, "hidden", { value: isHidden, configurable: true });
+    document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+def time_of(page: Page) -> float:
+    return float(page.locator("#time-text").inner_text().removeprefix("t "))
+
+
+def test_it_plays_from_the_folder_alone(page: Page, site: Path, server: str):
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(f"{server}/site/")
+    assert page.locator("#preview").evaluate("(image) => image.complete && image.naturalWidth") == 1200
+    page.get_by_role("button", name="Pause").wait_for()
+    expect(page.locator("#status")).to_contain_text("drawn here")
+    page.wait_for_function("() => Number(document.getElementById('time').value) > 0.1")
+    assert page.locator("#preview").count() == 0
+    assert page.title() == page.locator("h1").inner_text() == "Balls"
+    assert [url for url in asked if not url.startswith((f"{server}/site/", "blob:"))] == []
+    assert picture(page).std() > 0.1
+    page.get_by_role("button", name="Play").wait_for()
+
+    page.locator("#image").focus()
+    page.keyboard.press("ArrowLeft")
+    page.wait_for_function("() => location.hash.includes('at=35,20')")
+    wait_until_still(page)
+    page.evaluate(COUNT_WORK)
+    page.wait_for_timeout(500)
+    assert page.evaluate("work") == 0, "it works although nothing changes"
+
+    page.keyboard.press("Space")
+    page.wait_for_function("() => work > 10")
+    page.evaluate(HIDE, True)
+    page.wait_for_function("() => new Promise((d) => setTimeout(() => d(work), 300)).then((w) => w === work)")
+    before = page.evaluate("work = 0, document.getElementById('time').value")
+    page.wait_for_timeout(300)
+    assert page.evaluate("[work, document.getElementById('time').value]") == [0, before], "it works while it is hidden"
+    page.evaluate(HIDE, False)
+    page.wait_for_function("() => work > 10")
+
+
+def test_it_draws_what_the_service_draws(browser: Browser, site: Path, server: str, scene: Path):
+    with watched_page(browser, reduced_motion="reduce") as page:
+        page.goto(f"{server}/site/")
+        wait_until_still(page)
+        assert page.get_by_role("button", name="Play").is_visible(), "it plays although that isn't wanted"
+        for t, azimuth, elevation in ((0.0, 30, 20), (0.7, 200, -35)):
+            forget(page)
+            page.evaluate(f"location.hash = '#t={t}&at={azimuth},{elevation},5,0,0,0'")
+            wait_until_still(page)
+            got = picture(page)
+            height, width, _ = got.shape
+            wanted = drawn_by_the_service(scene, t, azimuth, elevation, (width, height))
+            assert wanted.std() > 0.1
+            assert psnr(got, wanted) >= tolerance("drawn_here_db")
+        with page.expect_download() as download:
+            page.get_by_role("button", name="Download the file").click()
+        assert Path(download.value.path()).read_bytes() == scene.read_bytes()
+
+
+def test_in_a_frame_of_another_page_it_has_the_stage_alone(page: Page, folder: Path, site: Path, server: str):
+    (folder / "other.html").write_text('<iframe src="site/" width="500" height="400" allow="fullscreen"></iframe>')
+    page.goto(f"{server}/other.html")
+    inside = page.frame_locator("iframe")
+    inside.get_by_role("button", name="Pause").wait_for()
+    assert not inside.locator("aside").is_visible()
+    box = inside.locator(".stage").bounding_box()
+    assert box is not None
+    assert box["height"] > 250
+
+
+def test_opened_as_a_file_it_says_what_to_do(browser: Browser, site: Path):
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto((site / "index.html").as_uri())
+        expect(page.locator("#banner")).to_contain_text(f"python -m http.server -d '{site}'")
+        assert page.locator("#preview").evaluate("(image) => image.complete && image.naturalWidth") == 1200
