@@ -176,7 +176,7 @@ def _global(job: PosesJob, database: Path, scratch: Path) -> list[pycolmap.Recon
 def _sorted(models: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
     for model in models.values():
         _drop_impossible(model)
-    return sorted(filter(pycolmap.Reconstruction.num_reg_images, models.values()), key=_size, reverse=True)
+    return sorted((model for model in models.values() if model.num_reg_images() > 1), key=_size, reverse=True)
 
 
 def _size(model: pycolmap.Reconstruction) -> tuple[int, int]:
@@ -205,7 +205,7 @@ def _spread_to_frames(model: pycolmap.Reconstruction, cameras: Sequence[CameraVi
     """Replace the view of each fixed camera by its frames, all with its pose."""
     for camera in cameras:
         image = model.find_image_with_name(camera.names[0])
-        if camera.frames is None or image is None:
+        if camera.frames is None or image is None or not image.has_pose:
             continue
         image.name = camera.frames[0]
         for name in camera.frames[1:]:

@@ -142,7 +142,7 @@ def colors(scene: SceneData) -> torch.Tensor:
 @pytest.fixture(scope="session")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Clip], Path, FrameSet, Poses]:
     folder = tmp_path_factory.mktemp("rig")
-    clips = fixed_camera_clips(folder, width=256, frames=5, offsets=(0.0, 0.1, 0.2))
+    clips = fixed_camera_clips(folder, width=256, frames=5, offsets=(0.0, 0.1, 0.2, 0.3))
     images = folder / "images"
     frames = extract_frames([clip.file for clip in clips], images, offsets=[clip.offset for clip in clips])
     return clips, images, frames, find_poses(images, frames, folder / "poses", threads=1)
