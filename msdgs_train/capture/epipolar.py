@@ -78,9 +78,3 @@ def line_distances(fundamental: np.ndarray, starts: np.ndarray, ends: np.ndarray
     algebraic = (ends * lines[..., :2]).sum(axis=-1) + lines[..., 2]
     gradient = (lines[..., :2] ** 2).sum(axis=-1) + (back[..., :2] ** 2).sum(axis=-1)
     return np.abs(algebraic) / np.sqrt(np.maximum(gradient, 1e-18))
-
-
-def line_normals(fundamental: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """[..., 2] unit normals of the epipolar lines in the first frame of [..., 2] points of the second one."""
-    normals = ends @ fundamental[:2, :2] + fundamental[2, :2]
-    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-18)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from msdgs_train.capture.epipolar import Lens, fundamental_of_poses, line_distances, line_normals, robust_fundamental
+from msdgs_train.capture.epipolar import Lens, fundamental_of_poses, line_distances, robust_fundamental
 from msdgs_train.capture.fixed_cameras import background
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.image_files import read_color, read_gray, write_image
@@ -34,12 +34,11 @@ FIT_SHARE = 0.9
 first poses may follow what moves."""
 CHANGED, NOISES = 14.0, 4.0
 """Least change of a color, in 8 bits and in units of the noise, from the background of a fixed camera."""
+CONTRAST, CONTRAST_WINDOW = 2.0, 15
+"""Least standard deviation in 8 bits, over so many pixels: the flow of a plain wall means nothing, and it has no
+features."""
 SMALLEST = 0.001
 """Part of the image of the smallest region that is kept, and of the largest hole that is closed."""
-
-
-CONTRAST, CONTRAST_WINDOW = 2.0, 9
-"""Least contrast across the line, in 8 bits a pixel, over so many pixels: flow of a plain wall says nothing."""
 
 
 class _Shot(NamedTuple):
@@ -47,16 +46,6 @@ class _Shot(NamedTuple):
 
     gray: np.ndarray
     camera_to_world: np.ndarray | None
-
-
-class _Geometry(NamedTuple):
-    """What explains the flow of a pair best."""
-
-    matrix: np.ndarray  # F, [3, 3], x_other · F · x_one = 0
-    ends: np.ndarray  # [H, W, 2] where the first frame's pixels are in the second one, in the pinhole image
-    returns: np.ndarray  # and the second frame's in the first one
-    there: np.ndarray  # [H, W] distances of the first frame's pixels to epipolar lines
-    back: np.ndarray  # and of the second frame's
 
 
 def find_moving(
@@ -118,8 +107,9 @@ def _against_epipolar_lines(images: Path, names: list[str], poses: Poses) -> Ite
                     evidence[index].append(back)
         complete = index - GAPS[-1]
         if complete >= 0:
-            score = _combined(evidence.pop(complete), shots.pop(complete).gray.shape)
-            mask = cleaned(score, SURE, LIKELY)
+            gray = shots.pop(complete).gray
+            score = _combined(evidence.pop(complete), gray.shape)
+            mask = cleaned(score, SURE, LIKELY) & _has_contrast(gray)
             yield names[complete], cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
 
 
@@ -135,37 +125,25 @@ def _pair(one: _Shot, other: _Shot, lens: Lens | None, flow: cv2.DISOpticalFlow)
         for first, second in ((one.gray, other.gray), (other.gray, one.gray))
     )
     sure = _returns(there, back)
-    known = one.camera_to_world is not None and other.camera_to_world is not None
-    best: _Geometry | None = None
-    explained = 0.0
+    poses = one.camera_to_world, other.camera_to_world
+    best, explained = None, 0.0
     for each in filter(None, (lens, Lens.unknown(one.gray.shape))):
         starts, ends, returns = each.undistorted(), each.undistorted(there), each.undistorted(back)
         geometries = [(robust_fundamental(starts[sure], ends[sure], each), FIT_SHARE)]
-        if known and each is lens:
-            geometries.append((fundamental_of_poses(one.camera_to_world, other.camera_to_world, each), 1.0))
+        if poses[0] is not None and poses[1] is not None and each is lens:
+            geometries.append((fundamental_of_poses(poses[0], poses[1], each), 1.0))
         for geometry, weight in geometries:
             if geometry is None:
                 continue
             forward = line_distances(geometry, starts, ends)
             share = weight * float(np.mean(forward[sure] < AT_REST))
             if share > explained:
-                backward = line_distances(geometry.T, starts, returns)
-                best, explained = _Geometry(geometry, ends, returns, forward, backward), share
+                best, explained = (forward, line_distances(geometry.T, starts, returns)), share
     if best is None:
-        return (np.full(one.gray.shape, np.nan),) * 2
-    noise = max(1.48 * float(np.median(best.there[sure])), NOISE)
-    sure &= _contrast_across(one.gray, line_normals(best.matrix, best.ends)) > CONTRAST
-    sure_back = _returns(back, there) & (
-        _contrast_across(other.gray, line_normals(best.matrix.T, best.returns)) > CONTRAST
-    )
-    return np.where(sure, best.there / noise, np.nan), np.where(sure_back, best.back / noise, np.nan)
-
-
-def _contrast_across(gray: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """[H, W] root mean square of the gradient along [H, W, 2] normals, in 8 bits a pixel, around each pixel."""
-    x, y = (cv2.Sobel(gray, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
-    along = (x * normals[..., 0] + y * normals[..., 1]).astype(np.float32)
-    return np.sqrt(cv2.blur(along * along, (CONTRAST_WINDOW, CONTRAST_WINDOW)))
+        nothing = np.full(one.gray.shape, np.nan)
+        return nothing, nothing
+    noise = max(1.48 * float(np.median(best[0][sure])), NOISE)
+    return np.where(sure, best[0] / noise, np.nan), np.where(_returns(back, there), best[1] / noise, np.nan)
 
 
 def _returns(there: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -175,6 +153,14 @@ def _returns(there: np.ndarray, back: np.ndarray) -> np.ndarray:
     x, y = x + there[..., 0], y + there[..., 1]
     returned = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e6, 1e6))
     return np.linalg.norm(there + returned, axis=2) < ROUND_TRIP
+
+
+def _has_contrast(gray: np.ndarray) -> np.ndarray:
+    """[H, W] uint8, 255 around pixels whose neighbourhood isn't plain."""
+    values = gray.astype(np.float64)
+    window = (CONTRAST_WINDOW, CONTRAST_WINDOW)
+    variance = cv2.blur(values * values, window) - cv2.blur(values, window) ** 2
+    return 255 * (variance > CONTRAST**2).astype(np.uint8)
 
 
 def _combined(evidence: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
