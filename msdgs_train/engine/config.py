@@ -14,6 +14,7 @@ from msdgs_train.engine.curriculum_config import CurriculumConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.losses.config import LossConfig
+from msdgs_train.poses.config import PoseConfig
 from msdgs_train.settings import Checked, optional
 
 SMALL_LAYER = MLPConfig(width=96, depth=2, xyz_frequencies=4, time_width=64)
@@ -112,6 +113,7 @@ class TrainConfig:
     curriculum: CurriculumConfig = CurriculumConfig()
     density: DensityConfig = DensityConfig()
     loss: LossConfig = LossConfig()
+    poses: PoseConfig = PoseConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     logging: LoggingConfig = LoggingConfig()
     model: ModelConfig = SMALL_MODEL

@@ -26,6 +26,7 @@ from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.parameters import LearningRate, ParamGroup, constant
 from msdgs_train.losses.photometric import photometric_loss
+from msdgs_train.poses.refinement import PoseRefinement
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.systems.base import Target, ViewLoss
 
@@ -58,6 +59,9 @@ class GaussianSplatting:
             else GradientStrategy.start(schedule, most, scale, self.size, views, is_rig)
         )
         self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
+        self.poses = None
+        if config.poses.pose_opt:
+            self.poses = PoseRefinement(config.poses, scene.splits["train"]).to(config.run.device)
 
     @property
     def size(self) -> int:
@@ -79,11 +83,13 @@ class GaussianSplatting:
             "sh_rest": constant(o.sh_rest_lr),
         }
         own = [ParamGroup(name, [g.get_parameter(name)], lr) for name, lr in rates.items()]
-        return own + self.model.motion_groups()
+        return own + self.model.motion_groups() + ([self.poses.parameter_group()] if self.poses else [])
 
     @torch.no_grad()
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
         schedule, surgery = self.schedule, RowSurgery(self.model.gaussians, optimizer)
+        if self.poses:
+            self.poses.center()
         if schedule.deform_start_step in steps:
             self.model.support.on_deform_start(self.model.gaussians, surgery)
         before, after = schedule.window(steps.start - 1), schedule.window(steps.stop - 1)
@@ -94,7 +100,8 @@ class GaussianSplatting:
     def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
         motions, c = self._motions(frame.t, step), self.config.loss
         posed = self._pose(self.model, frame.t, step, motions)
-        rgb, alpha, info = rasterize(*posed, frame.camera, background, self._options(step + 1))
+        seen = self.poses.seen(posed, frame.camera) if self.poses and step >= self.schedule.static_steps else posed
+        rgb, alpha, info = rasterize(*seen, frame.camera, background, self._options(step + 1))
         loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction, target.mask)
         loss = loss + self._regularizers(posed, motions, frame.t, step)
         if c.alpha_weight:
@@ -121,7 +128,12 @@ class GaussianSplatting:
         return [self.density.generator]
 
     def state(self) -> dict[str, Any]:
-        return {"model": self.model.state_dict(), "average": self.average.state(), "density": self.density.state()}
+        return {
+            "model": self.model.state_dict(),
+            "average": self.average.state(),
+            "density": self.density.state(),
+            "poses": self.poses.state_dict() if self.poses else None,
+        }
 
     def load_state(self, state: dict[str, Any], step: int) -> None:
         _resize(self.model.gaussians, state["model"])
@@ -129,6 +141,8 @@ class GaussianSplatting:
         average = state["average"] if self.schedule.averages_at(step) else None
         self.average.load_state(average, self.model)
         self.density.load_state(state["density"])
+        if self.poses:
+            self.poses.load_state_dict(state["poses"])
 
     @torch.no_grad()
     def save(self, path: Path, step: int) -> None:

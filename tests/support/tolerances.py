@@ -59,6 +59,9 @@ TABLE = (
     Row("gradient.finite_differences", 1e-6, "central differences, step 1e-6: 1e-10 / 1e-3 of the largest entry"),
     Row("gradient.autograd", 1e-9, "the same derivative in another order of operations, float64"),
     Row("gradient.float32", 1e-4, "sums over thousands of pixels of terms of both signs, each off by some 1e-6"),
+    Row(
+        "refined_pose", 1e-6, "the rotation is off by the third power of its angle, 4e-3, over 12, times slopes of 100"
+    ),
     Row("gradient.second_order", 1e-5, "what a linear step of 2e-4 leaves out: its square times curvatures up to 100"),
     Row("oracle_db", 70.0, "whole image, threshold pixels included: one step in 1 of 5,000 at every pixel"),
     Row("motion_vector", 2e-3, "pixels; a displacement of 30, stored and blended in float32, over a sum of weights"),

@@ -53,9 +53,10 @@ def is_same(one: dict[str, Any], other: dict[str, Any]) -> bool:
 
 
 @pytest.mark.slow
-def test_what_masked_pixels_show_has_no_effect(tmp_path: Path):
+@pytest.mark.parametrize("refined", [False, True])
+def test_what_masked_pixels_show_has_no_effect(tmp_path: Path, refined: bool):
     """Bit by bit: without SSIM, whose windows reach into the mask."""
-    config = small_config(ssim_lambda=0.0, mse_fraction=0.3)
+    config = small_config(ssim_lambda=0.0, mse_fraction=0.3, pose_opt=refined)
     results = [
         parameters(config, load_scene(masked_scene(tmp_path / name, HIDDEN, color)))
         for name, color in (("red", (255, 0, 0)), ("blue", (0, 0, 255)))
