@@ -49,6 +49,12 @@ class FrameSet:
     """Intervals of time that are left out, as all of their frames are blurred."""
     cuts: tuple[float, ...] = ()
     """Times in seconds at which the picture changes as a whole."""
+    black: int = 0
+    """Frames that are left out as they are black, or of one color."""
+    repeated: int = 0
+    """Frames that are left out as they show the picture before again."""
+    notes: tuple[str, ...] = ()
+    """What people should know of the videos, each a sentence."""
 
     def save(self, file: Path) -> None:
         """Write it as JSON."""
@@ -64,4 +70,7 @@ class FrameSet:
             tuple(CapturedFrame(**frame) for frame in stored["frames"]),
             stored["blurred"],
             tuple(stored["cuts"]),
+            stored["black"],
+            stored["repeated"],
+            tuple(stored["notes"]),
         )

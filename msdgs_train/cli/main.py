@@ -10,6 +10,7 @@ from rich.console import Console
 from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.writing import in_words
+from msdgs_train.cli.capture import Capture
 from msdgs_train.cli.compare import Compare
 from msdgs_train.cli.evaluate import Eval
 from msdgs_train.cli.fit import Fit, parse_fit
@@ -18,7 +19,7 @@ from msdgs_train.cli.synthetic import Synthetic
 from msdgs_train.cli.view import View
 from msdgs_train.layers.plugins import add_plugin
 
-Commands = Fit | Synthetic | Eval | Steps | View | Compare
+Commands = Fit | Capture | Synthetic | Eval | Steps | View | Compare
 """Each command has the name of its class in lower case."""
 
 EPILOG = "--plugin MODULE, for any command: a module or Python file that registers layers or systems (repeatable)."

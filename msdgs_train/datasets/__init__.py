@@ -9,6 +9,7 @@ from msdgs_train.datasets.common.intrinsics import principal_point_warnings
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame, SceneData
 from msdgs_train.datasets.common.times import NAMES, timed
+from msdgs_train.datasets.common.times_file import TIMES_FILE
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
 from msdgs_train.datasets.hypernerf import DATASET_FILE, load_hypernerf
 from msdgs_train.datasets.nerfstudio import TRANSFORMS_FILE, load_nerfstudio
@@ -40,7 +41,8 @@ def load_scene(
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
     for layout, marker, load in LAYOUTS:
         if any(folder.glob(marker)):
-            own = NAMES if load is load_colmap else None  # COLMAP stores no times
+            has_times = load is not load_colmap or (folder / TIMES_FILE).is_file()
+            own = None if has_times else NAMES  # COLMAP stores no times
             read = replace(load(folder, size), layout=layout)
             scene = timed(read, folder, own if time_from is None else time_from).in_unit_time()
             scene = replace(scene, warnings=(*scene.warnings, *principal_point_warnings(scene)))

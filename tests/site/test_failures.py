@@ -5,12 +5,13 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.support.processes import wait_until_still
+from tests.support.processes import forget, wait_until_still
 from tests.support.scene_files import write_scene
-from tests.support.sites import NO_WEBGL2, needs_runtime
+from tests.support.sites import NO_WEBGL2, needs_runtime, picture
 
 pytestmark = [pytest.mark.slow, needs_runtime]
 
@@ -97,13 +98,14 @@ def test_it_goes_on_after_a_lost_context(page: Page, site: Path, server: str):
     page.emulate_media(reduced_motion="reduce")
     page.goto(f"{server}/site/#t=0.5")
     wait_until_still(page)
-    before = page.locator(".stage").screenshot()
+    before = picture(page)
     page.evaluate("""() => {
         const graphics = document.querySelector("#image + canvas").getContext("webgl2");
         window.context = graphics.getExtension("WEBGL_lose_context");
         context.loseContext(); }""")
     expect(page.locator("#banner")).to_contain_text("The browser has taken the graphics from this page.")
+    forget(page)
     page.evaluate("context.restoreContext()")
     expect(page.locator("#banner")).to_be_hidden()
-    page.wait_for_function("() => document.getElementById('image').dataset.shown === 'full'")
-    assert page.locator(".stage").screenshot() == before
+    wait_until_still(page)
+    np.testing.assert_array_equal(picture(page), before)

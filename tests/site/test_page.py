@@ -66,7 +66,7 @@ def test_it_plays_from_the_folder_alone(page: Page, site: Path, server: str):
     page.wait_for_function("() => work > 10")
 
 
-def test_it_draws_what_the_service_draws(browser: Browser, site: Path, server: str, scene: Path):
+def test_it_draws_what_the_service_draws_and_fills_the_screen(browser: Browser, site: Path, server: str, scene: Path):
     with watched_page(browser, reduced_motion="reduce") as page:
         page.goto(f"{server}/site/")
         wait_until_still(page)
@@ -80,6 +80,10 @@ def test_it_draws_what_the_service_draws(browser: Browser, site: Path, server: s
             wanted = drawn_by_the_service(scene, t, azimuth, elevation, (width, height))
             assert wanted.std() > 0.1
             assert psnr(got, wanted) >= tolerance("drawn_here_db")
+        page.get_by_role("button", name="Full screen").click()
+        page.wait_for_function("() => document.fullscreenElement?.matches('main')")
+        page.keyboard.press("f")
+        page.wait_for_function("() => !document.fullscreenElement")
         with page.expect_download() as download:
             page.get_by_role("button", name="Download the file").click()
         assert Path(download.value.path()).read_bytes() == scene.read_bytes()

@@ -90,7 +90,10 @@ export class LocalSource {
       if (number !== this.number) return;
       this.canvas = this.viewer.stage.addCanvas();
       this.canvas.addEventListener("webglcontextlost", () => say(LOST));
-      this.canvas.addEventListener("webglcontextrestored", () => say(""));
+      this.canvas.addEventListener("webglcontextrestored", () => {
+        say("");
+        this.change();
+      });
       const engine = await openEngine({
         canvas: this.canvas,
         scene: contents,

@@ -5,8 +5,8 @@ the models SIMPLE_RADIAL, RADIAL and OPENCV are undistorted by `Frame.load_rgba`
 the same intrinsics. If `images` holds downscaled copies, intrinsics are scaled to them. `masks/a.png.png`, as COLMAP
 names them, or `masks/a.png` is the mask of `images/a.png`, black where pixels don't count.
 
-COLMAP stores no times: `load_scene` takes them from the images' names, and t = 0 here. The first image, in the order of
-names, and every 8th after it are test frames.
+COLMAP stores no times: they are those of `times.json`, or without it t = 0 here, and `load_scene` takes them from the
+images' names. The first image, in the order of names, and every 8th after it are test frames.
 """
 
 import math
@@ -26,6 +26,7 @@ from msdgs_train.datasets.common.masks import checked_mask, find_mask
 from msdgs_train.datasets.common.paths import find_file, not_found, posix
 from msdgs_train.datasets.common.readers import DatasetInvalid, finite_rows
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, hold_out, reduced
+from msdgs_train.datasets.common.times_file import with_stored_times
 
 SPARSE, IMAGES, MASKS = "sparse", "images", "masks"
 
@@ -39,6 +40,7 @@ def load_colmap(folder: Path, size: int | None = None) -> SceneData:
     if not images:
         raise DatasetInvalid(files[1], "images", "must be one or more")
     frames = [_frame(folder, files, image, cameras.get(image.camera_id), size) for image in images]
+    frames = with_stored_times(frames, folder)
     points, colors = _points(files[2], list(read.read_points(files[2])))
     half_size = scene_half_size(points, [frame.camera for frame in frames])
     warnings = _mask_warnings(folder / MASKS, frames)

@@ -22,6 +22,7 @@ class DatasetInvalid(MsdgsError):
         super().__init__(f"{file}: `{field}` {problem}")
         self.file = str(file)
         self.field = field
+        self.problem = problem
 
 
 class JsonObject(NamedTuple):

@@ -26,6 +26,7 @@ import numpy as np
 from msdgs_serve.writing import reason, replacing
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame
+from msdgs_train.datasets.common.video_colors import as_srgb
 
 MAX_TILT = 0.02
 """Sine of the angle, about 1°, up to which a display matrix is taken for one of a right angle, as FFmpeg does."""
@@ -77,7 +78,7 @@ class VideoFrame(Frame):
 def read_info(video: Path) -> VideoInfo:
     """Read the count, size and display matrix of the frames, of which only the first is decoded. Raises
     `DatasetInvalid` naming the file."""
-    with _opened(video) as container:
+    with opened_video(video) as container:
         if not container.streams.video:
             raise _invalid(video, "has no video stream")
         stream = container.streams.video[0]
@@ -85,16 +86,20 @@ def read_info(video: Path) -> VideoInfo:
         first = next(container.decode(stream), None)
         if first is None:
             raise _invalid(video, "has no frames")
-        turn = _turn(video, first.side_data.get("DISPLAYMATRIX"))
+        turn = display_turn(video, first)
         count = stream.frames
     if not count:
-        with _opened(video) as container:
+        with opened_video(video) as container:
             count = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))
     return VideoInfo(count, *((height, width) if turn.transposed else (width, height)), turn)
 
 
-def _turn(video: Path, display_matrix: Any) -> Turn:
-    """The turn by a display matrix of FFmpeg, in which (a b, c d) sends column x, row y to (a x + c y, b x + d y)."""
+def display_turn(video: Path, frame: Any) -> Turn:
+    """The turn by the matrix (a b, c d) of PyAV's frame, which sends column x, row y to (a x + c y, b x + d y).
+
+    Raises `DatasetInvalid` for one that isn't by multiples of 90°.
+    """
+    display_matrix = frame.side_data.get("DISPLAYMATRIX")
     if display_matrix is None or not any(np.frombuffer(bytes(display_matrix), np.int32)[:5]):
         return Turn()
     a, b, _, c, d = np.frombuffer(bytes(display_matrix), np.int32)[:5].tolist()
@@ -158,34 +163,29 @@ def _decode_to(file: Path, video: Path, wanted: VideoInfo) -> None:
 
 
 def _decoded(video: Path, wanted: VideoInfo) -> Iterator[np.ndarray]:
-    """Yield the frames as contiguous uint8 RGB [height, width, 3].
-
-    Colors are converted with the matrix that the video names, or with BT.601 if it names none, as FFmpeg does. Each new
-    pixel is the mean over the area that it covers, and differs from `resize_area` by less than 0.5 of 255 on average.
-    FFmpeg's default skips half of the chroma at the full size and at half of it, and differs by 1.4 to 5.
-    """
-    with _opened(video) as container:
-        from av.video.reformatter import Interpolation
-
-        area = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
-        stream, turn = container.streams.video[0], wanted.turn
+    """Yield the frames as contiguous uint8 sRGB [height, width, 3]."""
+    turn = wanted.turn
+    width, height = (wanted.height, wanted.width) if turn.transposed else (wanted.width, wanted.height)
+    with opened_video(video) as container:
+        stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         for frame in container.decode(stream):
-            width, height = (wanted.height, wanted.width) if turn.transposed else (wanted.width, wanted.height)
-            pixels = frame.to_ndarray(format="rgb24", interpolation=area, width=width, height=height)
-            yield np.ascontiguousarray(turn(pixels))
+            yield np.ascontiguousarray(turn(as_srgb(frame, width, height)))
 
 
 @contextmanager
-def _opened(video: Path) -> Iterator[Any]:
-    """The container of the video, in PyAV. Its errors in the block are raised as `DatasetInvalid`."""
+def opened_video(video: Path) -> Iterator[Any]:
+    """The container of the video, in PyAV. Its errors in the block are raised as `DatasetInvalid`.
+
+    The prefix `file:` has FFmpeg take no part of a name such as `12:30.mp4` for a protocol.
+    """
     try:
         import av  # an optional dependency
         from av.error import FFmpegError
     except ModuleNotFoundError as error:
         raise _invalid(video, f"needs {error.name} to be read: pip install 'msdgs[train]'") from None
     try:
-        with av.open(str(video)) as container:
+        with av.open(f"file:{video}") as container:
             yield container
     except FFmpegError as error:
         raise _invalid(video, f"can't be read: {error.strerror}") from None

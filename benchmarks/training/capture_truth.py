@@ -1,0 +1,171 @@
+"""Errors of the poses that a capture finds, on clips of known truth."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from benchmarks.measuring import machine, report_console, table
+from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
+from msdgs_serve.writing import scratch_folder
+from msdgs_train.capture.frame_set import FrameSet
+from msdgs_train.capture.frames import extract_frames
+from msdgs_train.capture.masked_poses import Keep, Progress, find_masked_poses, step_names
+from msdgs_train.capture.poses import Poses, find_poses
+from tests.support.clips import Clip, fixed_camera_clips, moving_camera_clip
+
+OFFSETS = (0.0, 0.08, 0.16, 0.24, 0.32, 0.4)  # seconds
+COLUMNS = ("clip", "registered", "rotation °, median", "largest", "centers %, median", "largest", "reprojection px")
+
+
+class Errors(NamedTuple):
+    """Errors after a similarity: rotations of the cameras give its rotation, centers its scale and translation."""
+
+    rotations: np.ndarray  # [N] degrees
+    centers: np.ndarray  # [N] percent of the diagonal of the box around the true centers
+
+
+def main(
+    frames: int = 90,
+    width: int = 512,
+    rig_frames: int = 24,
+    threads: int = 1,
+    seed: int = 0,
+    video: Path | None = None,
+    poses: Path | None = None,
+    check: bool = False,
+) -> int:
+    """Find the poses of synthetic clips, and of a real video with given poses, and print their errors.
+
+    python -m benchmarks.training.capture_truth --video hand.mp4 --poses precomputed.json
+
+    A camera moves around moving toys in front of a poster that swings, with and without masks of what moves; six
+    cameras stand around the toys. Centers' errors are percentages of the diagonal of the box around the true centers.
+
+    Args:
+        frames: Frames of the moving camera's clip.
+        width: Pixels of the clips.
+        rig_frames: Frames of each fixed camera.
+        threads: Threads of COLMAP; with one the figures repeat.
+        seed: Seed of the clips and of COLMAP.
+        video: A real video.
+        poses: Its poses as JSON: `poses`, a 3×5 matrix a frame as in LLFF but with OpenGL axes.
+        check: Test this benchmark with tiny clips.
+    """
+    if check:
+        return self_test()
+    made = table(f"{frames} frames of {width} px, seed {seed}, {threads} thread(s)", *COLUMNS)
+    with scratch_folder() as folder:
+        clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=60.0, seed=seed)
+        share = f"{clip.moving.mean():.0%} moves"
+        for name, found, taken in _with_and_without(clip.file, folder / "clip", seed, threads):
+            made.add_row(f"moving camera, {share}, {name}", *_row(found, taken, clip.camera_to_world, clip.times))
+        rig = fixed_camera_clips(folder, width=width, frames=rig_frames, offsets=OFFSETS, seed=seed)
+        made.add_row("six fixed cameras", *rig_row(rig, folder / "rig", seed, threads))
+        if video is not None and poses is not None:
+            given = read_poses(poses)
+            for name, found, taken in _with_and_without(video, folder / "video", seed, threads):
+                made.add_row(f"{video.name}, {name}", *_row(found, taken, given, None))
+    report_console().print(machine(), made)
+    return 0
+
+
+def _with_and_without(video: Path, folder: Path, seed: int, threads: int) -> list[tuple[str, Poses, FrameSet]]:
+    images = folder / "images"
+    taken = extract_frames([video], images)
+    masked = find_masked_poses(images, taken, _run_in(folder), seed=seed, threads=threads)
+    first = Poses.load(folder / step_names()[0], taken)
+    return [("without masks", first, taken), (f"masks, {masked.passes} passes", masked.poses, taken)]
+
+
+def _run_in(folder: Path) -> Keep:
+    """Runs each step, in a folder of its name."""
+
+    def keep(name: str, run: Callable[[Path, Progress], None]) -> Path:
+        (folder / name).mkdir(parents=True)
+        run(folder / name, _progress)
+        return folder / name
+
+    return keep
+
+
+def rig_row(rig: list[Clip], folder: Path, seed: int, threads: int) -> list[str]:
+    """The row of fixed cameras, one pose each."""
+    images = folder / "images"
+    taken = extract_frames([clip.file for clip in rig], images, offsets=[clip.offset for clip in rig])
+    found = find_poses(images, taken, folder, seed=seed, threads=threads, progress=_progress)
+    cameras = {frame.name: frame.camera for frame in taken.frames}
+    rows = [cameras[name] for name in found.registered]
+    return _cells(found, len(taken.frames), np.array([rig[row].camera_to_world[0] for row in rows]))
+
+
+def _row(found: Poses, taken: FrameSet, truth: np.ndarray, times: np.ndarray | None) -> list[str]:
+    """The row of a moving camera; frames are those at the nearest of `times`, or all in their order."""
+    order = {frame.name: index for index, frame in enumerate(taken.frames)}
+    rows = np.array([order[name] for name in found.registered], int)
+    if times is not None:
+        at = np.array([frame.time for frame in taken.frames])[rows]
+        rows = np.abs(at[:, None] - times).argmin(axis=1)
+    return _cells(found, len(taken.frames), truth[rows])
+
+
+def _cells(found: Poses, count: int, truth: np.ndarray) -> list[str]:
+    registered = f"{len(found.registered)} of {count}"
+    if len(truth) < 3:
+        return [registered, *["-"] * 4, f"{found.summary.error:.2f}"]
+    errors = errors_of(found.summary.camera_to_world, truth)
+    figures = [f"{reduce(each):.2f}" for each in errors for reduce in (np.median, np.max)]
+    return [registered, *figures, f"{found.summary.error:.2f}"]
+
+
+def errors_of(found: np.ndarray, truth: np.ndarray) -> Errors:
+    """Errors of [N, 4, 4] poses, camera to world, against true ones, after the best similarity."""
+    products = truth[:, :3, :3] @ found[:, :3, :3].transpose(0, 2, 1)
+    left, _, right = np.linalg.svd(products.sum(axis=0))
+    rotation = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    centers, true = found[:, :3, 3] @ rotation.T, truth[:, :3, 3]
+    centers, true = centers - centers.mean(axis=0), true - true.mean(axis=0)
+    scale = (centers * true).sum() / (centers**2).sum()
+    extent = np.linalg.norm(np.ptp(true, axis=0))
+    turns = np.einsum("nij,nij->n", rotation @ found[:, :3, :3], truth[:, :3, :3])
+    rotations = np.degrees(np.arccos(np.clip((turns - 1) / 2, -1, 1)))
+    return Errors(rotations, 100 * np.linalg.norm(scale * centers - true, axis=1) / extent)
+
+
+def read_poses(file: Path) -> np.ndarray:
+    """[N, 4, 4] camera to world, OpenCV axes, of `poses`."""
+    given = np.array(json.loads(file.read_text(encoding="utf-8"))["poses"])
+    poses = np.tile(np.eye(4), (len(given), 1, 1))
+    poses[:, :3] = given[:, :, :4]
+    return poses @ OPENGL_TO_OPENCV
+
+
+def _progress(stage: str, done: int, total: int) -> None:
+    if done == total:
+        Console(stderr=True).print(f"{stage}: {total}", markup=False)
+
+
+def self_test() -> int:
+    """A similarity leaves no errors, and a turned and moved camera has its own."""
+    random = np.random.default_rng(0)
+    with scratch_folder() as folder:
+        truth = moving_camera_clip(folder / "clip.mp4", width=64, frames=6).camera_to_world
+    turn = np.linalg.qr(random.standard_normal((3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    found = truth.copy()
+    found[:, :3, :3] = turn @ truth[:, :3, :3]
+    found[:, :3, 3] = 3 * truth[:, :3, 3] @ turn.T + 1
+    for errors in errors_of(found, truth):
+        np.testing.assert_allclose(errors, 0, atol=1e-4)
+    found[0, :3, :3] = found[1, :3, :3]
+    assert errors_of(found, truth).rotations.max() > 1
+    return main(frames=16, width=160, rig_frames=4)
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(main))

@@ -1,0 +1,119 @@
+"""The images of a folder as frames of one camera, upright as their EXIF orientation says."""
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from msdgs_train.capture.errors import CaptureFailed
+from msdgs_train.capture.pictures import Picture, fitted
+from msdgs_train.datasets.common.images import composite, read_rgba
+from msdgs_train.datasets.common.name_fields import natural_order
+from msdgs_train.datasets.common.name_times import NameWithoutTime, readings
+from msdgs_train.datasets.common.readers import DatasetInvalid
+
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif", ".dng")
+"""Of files that are meant as images, of which those that can't be read are refused."""
+VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp", ".gif")
+RATE = 30.0
+"""Images per second, as folders of images say nothing of it."""
+
+ORIENTATIONS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    2: lambda pixels: pixels[:, ::-1],
+    3: lambda pixels: pixels[::-1, ::-1],
+    4: lambda pixels: pixels[::-1],
+    5: lambda pixels: pixels.swapaxes(0, 1),
+    6: lambda pixels: pixels.swapaxes(0, 1)[:, ::-1],
+    7: lambda pixels: pixels.swapaxes(0, 1)[::-1, ::-1],
+    8: lambda pixels: pixels.swapaxes(0, 1)[::-1],
+}
+"""From stored to shown pixels [H, W, …], by EXIF's number; others are shown as they are stored."""
+
+
+class ImageSource:
+    """A folder of images as `Source`, in the natural order of their names; raises `CaptureFailed`."""
+
+    def __init__(self, folder: Path, size: int) -> None:
+        self.file = folder
+        self._files = image_files(folder)
+        self._times = _times([file.name for file in self._files])
+        self.count, self.duration, self.period = len(self._files), self._times[-1], 1 / RATE
+        first, *others = ((file, _shown_size(file)) for file in self._files)
+        for file, shown in others:
+            if shown != first[1]:
+                (width, height), (width0, height0) = shown, first[1]
+                raise CaptureFailed(
+                    file, f"is {width}×{height}, but {first[0].name} is {width0}×{height0}: give images of one size"
+                )
+        self.width, self.height = fitted(*first[1], size)
+
+    def pictures(self) -> Iterator[Picture]:
+        """Read each image once."""
+        import cv2
+
+        for index, (file, time) in enumerate(zip(self._files, self._times, strict=True)):
+            pixels = read_image(file)
+            if pixels.shape[:2] != (self.height, self.width):
+                pixels = cv2.resize(pixels, (self.width, self.height), interpolation=cv2.INTER_AREA)
+            yield Picture(index, time, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), lambda shown=pixels: shown)
+
+    def notes(self) -> list[str]:
+        return [f"{self.file.name} is a folder of images, which has no times: {RATE:g} images per second are assumed"]
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The images in a folder in the natural order of their names. Raises `CaptureFailed` if there are none."""
+    files = [file for file in folder.iterdir() if file.is_file() and not file.name.startswith(".")]
+    images = [file for file in files if file.suffix.lower() in ENDINGS]
+    if images:
+        return sorted(images, key=lambda file: natural_order(file.name))
+    if videos := [file.name for file in files if file.suffix.lower() in VIDEO_ENDINGS]:
+        raise CaptureFailed(folder, f"has no images, but videos such as {videos[0]}: give the videos themselves")
+    if below := sorted(each.name for each in folder.iterdir() if each.is_dir()):
+        raise CaptureFailed(folder, f"has no images, but folders such as {below[0]}: give a folder for each camera")
+    raise CaptureFailed(folder, f"has no images in it, whose names would end with {', '.join(ENDINGS)}")
+
+
+def read_image(file: Path) -> np.ndarray:
+    """Read uint8 RGB [H, W, 3], upright, transparent parts black. Raises `CaptureFailed`."""
+    try:
+        rgba = read_rgba(file)
+    except DatasetInvalid as error:
+        raise CaptureFailed(file, f"{error.problem}. Convert it to JPEG or PNG") from None
+    if (rgba[..., 3] < 255).any():
+        rgba[..., :3] = (255 * composite(rgba, (0.0, 0.0, 0.0)) + 0.5).astype(np.uint8)
+    return np.ascontiguousarray(_turn(_header(file))(rgba[..., :3]))
+
+
+@cache
+def _header(file: Path) -> tuple[int, int, int]:
+    """Width, height and EXIF orientation."""
+    reader = oiio.ImageInput.open(str(file))
+    if reader is None:
+        raise CaptureFailed(file, f"can't be read: {oiio.geterror().splitlines()[0]}. Convert it to JPEG or PNG")
+    spec = reader.spec()
+    reader.close()
+    return spec.width, spec.height, int(spec.getattribute("Orientation") or 1)
+
+
+def _turn(header: tuple[int, int, int]) -> Callable[[np.ndarray], np.ndarray]:
+    return ORIENTATIONS.get(header[2], lambda pixels: pixels)
+
+
+def _shown_size(file: Path) -> tuple[int, int]:
+    width, height, orientation = _header(file)
+    return (height, width) if orientation >= 5 else (width, height)
+
+
+def _times(names: list[str]) -> list[float]:
+    """Seconds after the first image: by the frame numbers in the names, which may leave some out, or by their order."""
+    try:
+        found = readings(names, range(len(names)), [None] * len(names))
+    except NameWithoutTime:
+        found = []
+    numbers = [int(time) for time in found[0].times] if len(found) == 1 and found[0].called is None else []
+    if not numbers or sorted(set(numbers)) != numbers:
+        numbers = list(range(len(names)))
+    return [(number - numbers[0]) / RATE for number in numbers]

@@ -1,0 +1,99 @@
+"""Camera poses of the frames of a capture, by structure from motion with COLMAP.
+
+A moving camera has a view for each of its frames. The frames of a camera that stands still share one pose: its view is
+the background, the median of its frames, which is free of what moves. Views of one camera share its intrinsics.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from msdgs_train.capture.fixed_cameras import background, is_fixed
+from msdgs_train.capture.frame_set import FrameSet
+from msdgs_train.capture.image_files import read_gray, write_image
+from msdgs_train.capture.sfm_process import CameraViews, PosesJob, run_sfm
+from msdgs_train.capture.sparse_model import GEOMETRY, Summary
+from msdgs_train.capture.views import View, matched_pairs
+
+SPARSE = "sparse"
+BACKGROUNDS = "backgrounds"
+FEATURE_MASKS = "feature_masks"
+ALL_PROCESSORS = -1
+
+
+@dataclass(frozen=True)
+class Poses:
+    """A sparse model of the frames, in units and axes of its own."""
+
+    model: Path
+    """Folder of the model in COLMAP's format, of images that are not undistorted."""
+    summary: Summary
+    fixed: tuple[bool, ...]
+    """Of each camera, whether it stands still."""
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """Names of the frames with a pose, sorted."""
+        return tuple(str(name) for name in self.summary.names)
+
+    @staticmethod
+    def load(workspace: Path, frames: FrameSet) -> "Poses":
+        """What `find_poses` left in a workspace, for the same frames."""
+        backgrounds = {file.stem for file in (workspace / BACKGROUNDS).glob("*.png")}
+        fixed = tuple(str(camera) in backgrounds for camera in range(len(frames.cameras)))
+        return Poses(workspace / SPARSE, Summary.load(workspace / GEOMETRY), fixed)
+
+
+def find_poses(
+    images: Path,
+    frames: FrameSet,
+    workspace: Path,
+    *,
+    masks: Path | None = None,
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Poses:
+    """Find the poses of frames in the folder `images`; `workspace` takes the database, the model and `geometry.npz`.
+
+    `masks` holds an image of each frame's name, white where no features are taken; backgrounds need none. One thread
+    gives the same poses each time. `progress` is called with the stage, what is done and the total. Raises
+    `CaptureFailed` if COLMAP ends with an error; without any model the result has no registered frames.
+    """
+    workspace = workspace.absolute()
+    workspace.mkdir(parents=True, exist_ok=True)
+    names = [tuple(frame.name for frame in frames.frames if frame.camera == i) for i in range(len(frames.cameras))]
+    fixed = tuple(_background(images, own, workspace, camera) for camera, own in enumerate(names))
+    views = [View(frame.name, frame.camera, frame.time) for frame in frames.frames if not fixed[frame.camera]] + [
+        View(f"{camera}.png", camera, 0.0, True) for camera, stands in enumerate(fixed) if stands
+    ]
+    cameras = tuple(
+        CameraViews(str(workspace / BACKGROUNDS), (f"{camera}.png",), own)
+        if fixed[camera]
+        else CameraViews(str(images.absolute()), own)
+        for camera, own in enumerate(names)
+        if own
+    )
+    feature_masks = None if masks is None else _feature_masks(masks, workspace / FEATURE_MASKS, views)
+    job = PosesJob(str(workspace), cameras, tuple(matched_pairs(views)), feature_masks, seed, threads or ALL_PROCESSORS)
+    run_sfm(job, images, progress)
+    return Poses.load(workspace, frames)
+
+
+def _background(images: Path, names: tuple[str, ...], workspace: Path, camera: int) -> bool:
+    """Write the background of a camera, if it is fixed, and return whether it is."""
+    files = [images / name for name in names]
+    file = workspace / BACKGROUNDS / f"{camera}.png"
+    file.unlink(missing_ok=True)
+    if not is_fixed(files):
+        return False
+    write_image(file, background(files))
+    return True
+
+
+def _feature_masks(masks: Path, out: Path, views: list[View]) -> str:
+    """Write the masks as COLMAP takes them, black where no features are taken, and return their folder."""
+    for view in views:
+        if not view.is_background:
+            write_image(out / f"{view.name}.png", 255 - read_gray(masks / view.name))
+    return str(out)

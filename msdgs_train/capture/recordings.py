@@ -1,0 +1,70 @@
+"""The recordings of a capture and the folder that it fills: what they are, and that neither is mistaken for another."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+from msdgs_serve import __version__
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.writing import write_text
+from msdgs_train.capture.errors import CaptureFailed
+
+WORK = "capture"
+"""Folder of the steps' results in the dataset's folder."""
+CLAIM = "recordings.json"
+"""File in `WORK` that tells whose capture the folder is."""
+BYTES_PER_PIXEL = 4.0
+"""Frames and images of the dataset as PNG, of 1.5 to 2 bytes a pixel each, and masks."""
+BYTES_PER_FRAME = 2_000_000
+"""COLMAP's database: descriptors of 8,192 features, and matches."""
+LONGEST_ASPECT = 0.75
+"""Shorter over longer side of the frames that take most space."""
+
+
+def digest_of(recordings: Sequence[Path]) -> str:
+    """A digest of the contents of video files and of folders of images, and of their order; not of paths."""
+    digest = hashlib.sha256(__version__.encode())
+    for recording in recordings:
+        files = sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
+        digest.update(f"{len(files)}\n".encode())
+        for file in files:
+            with file.open("rb") as opened:
+                digest.update(hashlib.file_digest(opened, "sha256").digest())
+    return digest.hexdigest()
+
+
+def claim(data: Path, digest: str) -> None:
+    """Make the folder of a capture. Raises `InvalidInput` if it holds anything but a capture of the same recordings."""
+    mark = data / WORK / CLAIM
+    if data.exists() and not data.is_dir():
+        raise InvalidInput("DATA", "a folder, new or empty, after the recordings", data)
+    if mark.is_file():
+        if json.loads(mark.read_text(encoding="utf-8"))["digest"] != digest:
+            other = "it holds that of other recordings, or of another version of msdgs"
+            raise InvalidInput("DATA", "a new folder, or that of an earlier capture of the same", f"{data}: {other}")
+        return
+    if data.is_dir() and any(data.iterdir()):
+        raise InvalidInput("DATA", "a new or empty folder", f"{data}, which holds other files")
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    write_text(mark, json.dumps({"digest": digest}) + "\n")
+
+
+def required_bytes(frames: int, size: int) -> int:
+    """Bytes of disk that a capture takes at most while it runs, about; `size` is the longer side in pixels."""
+    return round(frames * (size * size * LONGEST_ASPECT * BYTES_PER_PIXEL + BYTES_PER_FRAME))
+
+
+def require_disk(data: Path, needed: int) -> None:
+    """Raise `CaptureFailed` if the disk of a folder has less than `needed` bytes to spare, beside what it holds."""
+    held = sum(file.stat().st_size for file in data.rglob("*") if file.is_file())
+    free = shutil.disk_usage(data).free
+    if free + held < needed:
+        problem = f"needs up to {gigabytes(needed)} on a disk that has {gigabytes(free)} free"
+        raise CaptureFailed(data, f"{problem}; free space, choose another disk, or give smaller --frames or --size")
+
+
+def gigabytes(count: int) -> str:
+    """A number of bytes in words."""
+    return f"{count / 1e9:.1f} GB"

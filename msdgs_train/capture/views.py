@@ -1,0 +1,54 @@
+"""The images that poses are found of, and the pairs of them that are matched."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+OVERLAP = 10
+"""Following frames that a frame is matched with; beyond them those at distances of powers of two."""
+KEYFRAMES = 24
+"""Frames of a moving camera, at even distances, that are all matched with each other: the camera may come back."""
+LINKS = 40
+"""Frames of a moving camera that are matched with those of another camera."""
+
+
+@dataclass(frozen=True)
+class View:
+    """The frame of a moving camera, or the background of a fixed one."""
+
+    name: str
+    """Path below its folder."""
+    camera: int
+    time: float
+    """Seconds; 0 for a background."""
+    is_background: bool = False
+
+
+def matched_pairs(views: Sequence[View]) -> list[tuple[str, str]]:
+    """Names of the views to match: neighbours, keyframes, and views of one time across cameras."""
+    cameras = [[view for view in views if view.camera == camera] for camera in sorted({view.camera for view in views})]
+    pairs = [pair for own in cameras for pair in _own_pairs(own)]
+    pairs += [pair for one, other in combinations(cameras, 2) for pair in _cross_pairs(one, other)]
+    return list(dict.fromkeys((first.name, second.name) for first, second in pairs))
+
+
+def _own_pairs(views: Sequence[View]) -> Iterator[tuple[View, View]]:
+    distances = [*range(1, OVERLAP + 1)]
+    while distances[-1] < len(views):
+        distances.append(1 << distances[-1].bit_length())
+    for first, view in enumerate(views):
+        yield from ((view, views[first + distance]) for distance in distances if first + distance < len(views))
+    yield from combinations(_spread(views, KEYFRAMES), 2)
+
+
+def _cross_pairs(one: Sequence[View], other: Sequence[View]) -> Iterator[tuple[View, View]]:
+    few, many = sorted((one, other), key=len)
+    for view in _spread(many, LINKS):
+        yield view, min(few, key=lambda candidate: abs(candidate.time - view.time))
+
+
+def _spread(views: Sequence[View], count: int) -> list[View]:
+    """At most `count` of the views, at even distances, with the first and the last."""
+    if len(views) <= count:
+        return list(views)
+    return [views[round(index * (len(views) - 1) / (count - 1))] for index in range(count)]
