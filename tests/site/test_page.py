@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.support.pages import watched_page
 from tests.support.processes import forget, wait_until_still
@@ -106,3 +106,26 @@ def test_opened_as_a_file_it_says_what_to_do(browser: Browser, site: Path):
         page.goto((site / "index.html").as_uri())
         expect(page.locator("#banner")).to_contain_text(f"python -m http.server -d '{site}'")
         assert page.locator("#preview").evaluate("(image) => image.complete && image.naturalWidth") == 1200
+
+
+def test_while_it_loads_it_shows_the_preview_and_counts_bytes(page: Page, site: Path, server: str):
+    held: list[Route] = []
+    page.emulate_media(reduced_motion="reduce")
+    page.route("**/scene.onnx.gz", lambda route: held.append(route))
+    with page.expect_request("**/scene.onnx.gz"):
+        page.goto(f"{server}/site/")
+    expect(page.locator("#loading")).to_be_visible()
+    assert page.locator("#preview").is_visible()
+    held[0].continue_()
+    wait_until_still(page)
+    assert not page.locator("#loading").is_visible()
+
+    page.unroute("**/scene.onnx.gz")
+    page.goto(f"{server}/site/LICENSE.txt")
+    told, stored = page.evaluate("""async () => {
+        const { description, sceneFile } = await import(new URL("viewer/site/files.js", document.baseURI));
+        const [scene, told] = [await description(), []];
+        await sceneFile(scene, (bytes) => told.push(bytes));
+        return [told, scene.file.stored]; }""")
+    assert told[-1] == {"loaded": stored, "total": stored}
+    assert stored == (site / "scene.onnx.gz").stat().st_size
