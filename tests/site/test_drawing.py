@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.slow, needs_runtime]
 SIZE = 120, 90
 PLACE = Similarity(10.0, (3.0, -2.0, 1.0))
 MANY = 20_000
-"""Gaussians: more than a draw call's indices address at once."""
+"""Gaussians: several rows of each texture."""
 
 OPEN = """async ([name, files]) => {
     const { openEngine } = await import("/viewer/local/engine.js");

@@ -20,7 +20,7 @@ COUNT_WORK = """() => {
     };
     counted(window, "requestAnimationFrame");
     counted(Worker.prototype, "postMessage");
-    counted(WebGL2RenderingContext.prototype, "drawElementsInstanced");
+    counted(WebGL2RenderingContext.prototype, "drawArrays");
 }"""
 """Counts what a page does by itself: animation frames, messages to workers and draw calls."""
 HIDE = """(isHidden) => {

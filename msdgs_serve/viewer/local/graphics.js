@@ -1,10 +1,10 @@
 // The WebGL2 resources of a scene, and one frame of it.
 
 import {
-  BATCH, BLEND_FRAGMENT, BLEND_VERTEX, BRIGHTEST, EVERYWHERE, MOVING, RESOLVE, ROW_BITS, STILL, projectShader,
+  BLEND_FRAGMENT, BLEND_VERTEX, BRIGHTEST, EVERYWHERE, MOVING, RESOLVE, ROW_BITS, STILL, projectShader,
   samplersOf,
 } from "./shaders.js"; // prettier-ignore
-import { Texels, program, quadIndices, target } from "./webgl.js";
+import { Texels, program, target } from "./webgl.js";
 
 /** Channels that are drawn. */
 export const CHANNELS = ["rgb", "alpha", "depth"];
@@ -48,7 +48,6 @@ export class Graphics {
     this.blend.setUnits(["placed", "painted"]);
     const rows = Math.max(Math.ceil(scene.gaussians / (1 << ROW_BITS)), 1);
     this.splats = target(gl, [gl.RGBA32UI, gl.RGBA32UI], 1 << ROW_BITS, rows);
-    this.quads = quadIndices(gl, BATCH);
     this.frame = null;
   }
 
@@ -119,13 +118,10 @@ export class Graphics {
     if (!found) return;
     blend.use();
     gl.uniform2f(blend.at("size"), frame.width, frame.height);
-    gl.uniform1i(blend.at("found"), found);
     blend.bind(this.splats.textures);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this.quads);
-    const batches = Math.ceil(found / BATCH);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * Math.min(found, BATCH), gl.UNSIGNED_SHORT, 0, batches);
+    gl.drawArrays(gl.TRIANGLES, 0, 3 * found);
   }
 
   /** The pixels of the frame that was drawn in this task. */

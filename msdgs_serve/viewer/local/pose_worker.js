@@ -45,6 +45,7 @@ class Poser {
     this.session = await this.ort.InferenceSession.create(bytes, options).catch((error) => {
       throw new Error(`onnxruntime can’t open the scene file: ${error.message}`);
     });
+    this.ort.env.wasm.wasmBinary = undefined; // 14 MB, compiled now
     const rows = Object.fromEntries(this.session.outputMetadata.map(({ name, shape }) => [name, shape[0]]));
     this.moving ??= rows.means;
     this.changing = APPEARANCE.filter((name) => `static_${name}` in rows);

@@ -4,6 +4,7 @@ const SLOTS = 3; // poses that are kept: two that are shown, and the next
 const AHEAD = 2; // times until a pose is there: the next one is asked for then, and there before this one is passed
 const SMOOTHING = 0.3; // weight of the newest measurement
 const LEAP = 4; // times the way ahead: a jump in time
+const BREAK = 1; // seconds without a frame, as of a hidden page: no measure of its display
 
 export class Poses {
   /** `ask({ t, steps, slot })` asks for a pose, which is given to `received`. */
@@ -76,8 +77,8 @@ export class Poses {
 
   #measureRate(t, now) {
     if (t === this.last?.t) return;
-    if (this.last && t > this.last.t && now > this.last.now) {
-      const interval = now - this.last.now;
+    const interval = now - this.last?.now;
+    if (t > this.last?.t && interval > 0 && interval < BREAK) {
       this.interval = smoothed(this.interval, interval);
       this.rate = smoothed(this.rate, (t - this.last.t) / interval);
     }

@@ -88,14 +88,15 @@ export class LocalSource {
     try {
       const contents = await this.file(scene, (bytes) => this.#showProgress(bytes));
       if (number !== this.number) return;
-      this.canvas = this.viewer.stage.addCanvas();
-      this.canvas.addEventListener("webglcontextlost", () => say(LOST));
-      this.canvas.addEventListener("webglcontextrestored", () => {
+      const canvas = this.viewer.stage.addCanvas();
+      this.canvas = canvas;
+      canvas.addEventListener("webglcontextlost", () => canvas === this.canvas && say(LOST)); // else `#close` gave it back
+      canvas.addEventListener("webglcontextrestored", () => {
         say("");
         this.change();
       });
       const engine = await openEngine({
-        canvas: this.canvas,
+        canvas,
         scene: contents,
         runtime: this.runtime,
         onProgress: (bytes) => this.#showProgress(bytes),

@@ -112,16 +112,6 @@ export function target(gl, formats, width, height) {
   return { framebuffer, textures, width, height, remove };
 }
 
-/** Indices of the triangles of `count` quads of four vertices each. */
-export function quadIndices(gl, count) {
-  const indices = new Uint16Array(6 * count);
-  for (let k = 0; k < count; k += 1) indices.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * k + corner), 6 * k);
-  const buffer = gl.createBuffer();
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, buffer);
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
-  return buffer;
-}
-
 function nearest(gl) {
   const texture = gl.createTexture();
   gl.activeTexture(gl.TEXTURE0);

@@ -1,7 +1,7 @@
 """Captures of clips of known truth, from where quality breaks to where it is good: the limits of
 `msdgs_train.capture.verdict` come from here.
 
-    python -m benchmarks.training.verdicts [--only TEXT] [--out verdicts.csv]
+    python -m benchmarks.capture.verdicts [--only TEXT] [--out verdicts.csv]
 
 Cameras move on arcs of 1° to 80°, turn on the spot, or stand still, with and without a large moving poster; then
 few frames, and motion blur. Each row has the figures of a capture, the largest rotation error in degrees, the centers'
@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.capture.capture_truth import errors_of
 from benchmarks.measuring import machine
-from benchmarks.training.capture_truth import errors_of
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.capture.job import CaptureJob, CaptureOptions
 from msdgs_train.capture.masked_poses import step_names

@@ -47,7 +47,7 @@ def main(
 ) -> int:
     """Find the poses of synthetic clips, and of a real video with given poses, and print their errors.
 
-    python -m benchmarks.training.capture_truth --video hand.mp4 --poses precomputed.json
+    python -m benchmarks.capture.capture_truth --video hand.mp4 --poses precomputed.json
 
     A camera moves around moving toys in front of a poster that swings, with and without masks of what moves; six
     cameras stand around the toys. Centers' errors are percentages of the diagonal of the box around the true centers.

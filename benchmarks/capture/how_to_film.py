@@ -1,6 +1,6 @@
 """Draw the pictures of docs/your_scene.md: three ways to move a camera, from above, and what it sees.
 
-python -m benchmarks.training.how_to_film docs/images
+python -m benchmarks.capture.how_to_film docs/images
 """
 
 import argparse
