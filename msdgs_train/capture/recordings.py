@@ -23,14 +23,25 @@ BYTES_PER_FRAME = 2_000_000
 
 
 def digest_of(recordings: Sequence[Path]) -> str:
-    """A digest of the contents of video files and of folders of images, and of their order; not of paths."""
-    digest = hashlib.sha256(__version__.encode())
+    """A digest of the contents of video files and of folders of images, and of their order; not of paths.
+
+    Raises `CaptureFailed` if two of them are the same.
+    """
+    known: dict[str, Path] = {}
     for recording in recordings:
-        files = sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
-        digest.update(f"{len(files)}\n".encode())
-        for file in files:
-            with file.open("rb") as opened:
-                digest.update(hashlib.file_digest(opened, "sha256").digest())
+        digest = _digest(recording)
+        if digest in known:
+            raise CaptureFailed(recording, f"is the same recording as {known[digest]}: give each camera's once")
+        known[digest] = recording
+    return hashlib.sha256("\n".join([__version__, *known]).encode()).hexdigest()
+
+
+def _digest(recording: Path) -> str:
+    files = sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
+    digest = hashlib.sha256(f"{len(files)}\n".encode())
+    for file in files:
+        with file.open("rb") as opened:
+            digest.update(hashlib.file_digest(opened, "sha256").digest())
     return digest.hexdigest()
 
 
@@ -40,11 +51,12 @@ def claim(data: Path, digest: str) -> None:
     if data.exists() and not data.is_dir():
         raise InvalidInput("DATA", "a folder, new or empty, after the recordings", data)
     if mark.is_file():
-        if json.loads(mark.read_text(encoding="utf-8"))["digest"] != digest:
+        if json.loads(mark.read_text(encoding="utf-8"))["digest"] == digest:
+            return
+        if any(file.name != CLAIM for file in mark.parent.iterdir()):
             other = "it holds that of other recordings, or of another version of msdgs"
             raise InvalidInput("DATA", "a new folder, or that of an earlier capture of the same", f"{data}: {other}")
-        return
-    if data.is_dir() and any(data.iterdir()):
+    elif data.is_dir() and any(data.iterdir()):
         raise InvalidInput("DATA", "a new or empty folder", f"{data}, which holds other files")
     mark.parent.mkdir(parents=True, exist_ok=True)
     write_text(mark, json.dumps({"digest": digest}) + "\n")
