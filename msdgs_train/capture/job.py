@@ -13,7 +13,7 @@ from msdgs_train.capture.frames import extract_frames, starts
 from msdgs_train.capture.masked_poses import MaskedPoses, find_masked_poses, step_names
 from msdgs_train.capture.measures import measure_frames, measure_poses
 from msdgs_train.capture.offsets import find_offsets
-from msdgs_train.capture.recordings import WORK, claim, digest_of, require_disk, required_bytes
+from msdgs_train.capture.recordings import WORK, claim, digest_of, held, require_disk, required_bytes
 from msdgs_train.capture.report import Report, write_report
 from msdgs_train.capture.steps import Progress, Steps, Watch
 from msdgs_train.capture.verdict import Verdict, judge, judge_frames
@@ -83,8 +83,13 @@ class CaptureJob:
     def run(self) -> Outcome:
         """Do the steps that aren't done. Without a scene there is no dataset, but a report.
 
-        Raises `CaptureFailed` if the disk lacks space, or a recording can't be read.
+        Raises `CaptureFailed` if the disk lacks space, or a recording can't be read, `InvalidInput` if another process
+        captures into the folder.
         """
+        with held(self.data):
+            return self._run()
+
+    def _run(self) -> Outcome:
         require_disk(self.data, self.required_bytes)
         self.steps.do("frames", self._without_seed(), self._take_frames)
         frames = FrameSet.load(self.steps.path("frames") / FRAMES)

@@ -1,9 +1,12 @@
 """The recordings of a capture and the folder that it fills: what they are, and that neither is mistaken for another."""
 
+import fcntl
 import hashlib
 import json
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from msdgs_serve import __version__
@@ -60,6 +63,20 @@ def claim(data: Path, digest: str) -> None:
         raise InvalidInput("DATA", "a new or empty folder", f"{data}, which holds other files")
     mark.parent.mkdir(parents=True, exist_ok=True)
     write_text(mark, json.dumps({"digest": digest}) + "\n")
+
+
+@contextmanager
+def held(data: Path) -> Iterator[None]:
+    """Keep other processes from capturing into a folder. Raises `InvalidInput` if one does already."""
+    folder = os.open(data / WORK, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InvalidInput("DATA", "a folder into which no other process captures", data) from None
+        yield
+    finally:
+        os.close(folder)
 
 
 def required_bytes(recordings: Sequence[Path], frames: int, size: int) -> int:

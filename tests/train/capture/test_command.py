@@ -13,7 +13,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.capture import job as job_module
 from msdgs_train.capture import recordings as recordings_module
 from msdgs_train.capture.errors import CaptureFailed
-from msdgs_train.capture.recordings import claim, digest_of
+from msdgs_train.capture.recordings import claim, digest_of, held
 from msdgs_train.cli.capture import Capture
 from msdgs_train.cli.main import _parse, main
 from msdgs_train.datasets import load_scene
@@ -148,6 +148,18 @@ def test_a_folder_in_which_nothing_was_captured_is_free_for_other_recordings(tmp
     (data / "capture" / "frames").mkdir()
     with pytest.raises(InvalidInput, match="other recordings"):
         claim(data, "one")
+
+
+def test_two_captures_into_one_folder_at_once_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    clip = write_clip(tmp_path / "clip.mp4", pictures(4))
+    data = tmp_path / "data"
+    claim(data, digest_of([clip]))
+    with held(data):
+        assert main(["capture", str(clip), str(data)]) == EXIT_INVALID
+    assert "a folder into which no other process captures" in capsys.readouterr().err
+    assert [path.name for path in (data / "capture").iterdir()] == ["recordings.json"]
+    with held(data):
+        pass
 
 
 def test_a_full_disk_is_told_before_it_starts(
