@@ -15,6 +15,8 @@ ENOUGH = 0.3
 """Part of the corners that are at rest when the camera is; the others are on what moves."""
 COMPARED = 8
 """Frames that the first one is compared with."""
+PASSING = 0.15
+"""Part of the compared frames in which something may hide the background."""
 BACKGROUND = 40
 """Frames whose median is the background."""
 
@@ -28,7 +30,7 @@ def is_fixed(files: Sequence[Path]) -> bool:
     if corners is None:
         return False
     still = [_still_part(first, read_gray(file), corners) for file in spread(files[1:], COMPARED)]
-    return float(np.median(still)) > ENOUGH
+    return float(np.quantile(still, PASSING)) > ENOUGH
 
 
 def background(files: Sequence[Path]) -> np.ndarray:

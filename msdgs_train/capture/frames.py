@@ -38,15 +38,15 @@ def extract_frames(
     Each video is decoded once, with two of its frames in memory. Raises `CaptureFailed`, `InvalidInput` and
     `WriteFailed`.
     """
-    starts = _starts(inputs, offsets)
     for name, value in (("frames", frames), ("size", size)):
         if value < 1:
             raise InvalidInput(name, "1 or more", value)
+    offsets = starts(inputs, offsets)
     sources = [open_source(file, size) for file in inputs]
     step = max(source.duration + source.period for source in sources) / frames
     ticker = _Ticker(sum(source.count for source in sources), progress)
     selections: list[Selection] = []
-    for index, (source, start) in enumerate(zip(sources, starts, strict=True)):
+    for index, (source, start) in enumerate(zip(sources, offsets, strict=True)):
         moments = _moments(source, start, frames, step, selections[0] if selections else None)
         digits = max(DIGITS, len(str(source.count)))
         name = f"{camera_name(index, len(sources))}/" if len(sources) > 1 else ""
@@ -54,7 +54,7 @@ def extract_frames(
         selections.append(select(source.pictures(), start, moments, writer, ticker))
         if not selections[-1].taken:
             raise CaptureFailed(source.file, _nothing(selections[-1]))
-    return _frame_set(sources, starts, selections, folder)
+    return _frame_set(sources, offsets, selections, folder)
 
 
 def open_source(file: Path, size: int) -> Source:
@@ -69,14 +69,14 @@ def camera_name(index: int, count: int) -> str:
     return "" if count == 1 else f"cam{index + 1:0{max(2, len(str(count)))}}"
 
 
-def _starts(inputs: Sequence[Path], offsets: Sequence[float] | None) -> list[float]:
-    """Seconds on the clock of the first camera at which each starts."""
+def starts(inputs: Sequence[Path], offsets: Sequence[float] | None) -> list[float]:
+    """Seconds on the clock of the first camera at which each starts, 0 if `offsets` is None. Raises `InvalidInput`."""
     if not inputs:
         raise InvalidInput("inputs", "one video or more", "none")
     if offsets is None:
         return [0.0] * len(inputs)
     if len(offsets) != len(inputs) or not np.isfinite(offsets).all():
-        raise InvalidInput("offsets", f"{len(inputs)} finite numbers, one a video", list(offsets))
+        raise InvalidInput("offsets", f"one finite number for each recording, {len(inputs)}", list(offsets))
     return [offset - offsets[0] for offset in offsets]
 
 

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.capture.dataset import write_dataset
 from msdgs_train.capture.frame_set import FrameSet
-from msdgs_train.capture.frames import extract_frames
+from msdgs_train.capture.frames import extract_frames, starts
 from msdgs_train.capture.masked_poses import MaskedPoses, find_masked_poses, step_names
 from msdgs_train.capture.measures import measure_frames, measure_poses
 from msdgs_train.capture.offsets import find_offsets
-from msdgs_train.capture.recordings import WORK, claim, digest_of, require_disk, required_bytes
+from msdgs_train.capture.recordings import WORK, claim, digest_of, held, require_disk, required_bytes
 from msdgs_train.capture.report import Report, write_report
 from msdgs_train.capture.steps import Progress, Steps, Watch
 from msdgs_train.capture.verdict import Verdict, judge, judge_frames
@@ -27,6 +27,8 @@ STEPS: dict[str, tuple[str, ...]] = {
 """The steps, and what they put into the dataset's folder. A dataset is one once it has `sparse`."""
 
 FRAMES, IMAGES = "frames.json", "images"
+MIN_SIZE = 64
+"""Pixels; smaller pictures have next to no features."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +44,9 @@ class CaptureOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, value in (("frames", self.frames), ("size", self.size)):
-            if value < 1:
-                raise InvalidInput(name, "1 or more", value)
+        for name, value, least in (("frames", self.frames, 1), ("size", self.size, MIN_SIZE), ("seed", self.seed, 0)):
+            if not least <= value < 2**31:
+                raise InvalidInput(name, f"{least} or more, below 2³¹", value)
 
 
 class Outcome(NamedTuple):
@@ -69,6 +71,9 @@ class CaptureJob:
         watch: Watch,
     ) -> None:
         """Raises `InvalidInput` if `data` holds anything else, `CaptureFailed` if a recording can't be read."""
+        if threads is not None and threads < 1:
+            raise InvalidInput("threads", "1 or more", threads)
+        starts(recordings, options.offsets)
         self.recordings, self.data, self.options, self.threads = recordings, data, options, threads
         self.required_bytes = required_bytes(recordings, options.frames, options.size)
         digest = digest_of(recordings)
@@ -78,8 +83,13 @@ class CaptureJob:
     def run(self) -> Outcome:
         """Do the steps that aren't done. Without a scene there is no dataset, but a report.
 
-        Raises `CaptureFailed` if the disk lacks space, or a recording can't be read.
+        Raises `CaptureFailed` if the disk lacks space, or a recording can't be read, `InvalidInput` if another process
+        captures into the folder.
         """
+        with held(self.data):
+            return self._run()
+
+    def _run(self) -> Outcome:
         require_disk(self.data, self.required_bytes)
         self.steps.do("frames", self._without_seed(), self._take_frames)
         frames = FrameSet.load(self.steps.path("frames") / FRAMES)

@@ -57,9 +57,8 @@ def find_offsets(videos: Sequence[Path]) -> Offsets:
     sounds = [read_sound(video) for video in videos]
     silent = [video.name for video, sound in zip(videos, sounds, strict=True) if sound is None]
     if silent:
-        return Offsets(
-            nothing, nothing, f"{', '.join(silent)} has no sound: all are taken to start together, give --offsets."
-        )
+        problem = f"There is no sound in {', '.join(silent)}"
+        return Offsets(nothing, nothing, f"{problem}: all are taken to start together, give --offsets.")
     seconds, confidence = _chained([sound for sound in sounds if sound is not None])
     unclear = [video.name for video, each in zip(videos, confidence, strict=True) if each < MIN_CONFIDENCE]
     if unclear:

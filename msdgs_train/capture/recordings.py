@@ -1,9 +1,12 @@
 """The recordings of a capture and the folder that it fills: what they are, and that neither is mistaken for another."""
 
+import fcntl
 import hashlib
 import json
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from msdgs_serve import __version__
@@ -23,14 +26,25 @@ BYTES_PER_FRAME = 2_000_000
 
 
 def digest_of(recordings: Sequence[Path]) -> str:
-    """A digest of the contents of video files and of folders of images, and of their order; not of paths."""
-    digest = hashlib.sha256(__version__.encode())
+    """A digest of the contents of video files and of folders of images, and of their order; not of paths.
+
+    Raises `CaptureFailed` if two of them are the same.
+    """
+    known: dict[str, Path] = {}
     for recording in recordings:
-        files = sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
-        digest.update(f"{len(files)}\n".encode())
-        for file in files:
-            with file.open("rb") as opened:
-                digest.update(hashlib.file_digest(opened, "sha256").digest())
+        digest = _digest(recording)
+        if digest in known:
+            raise CaptureFailed(recording, f"is the same recording as {known[digest]}: give each camera's once")
+        known[digest] = recording
+    return hashlib.sha256("\n".join([__version__, *known]).encode()).hexdigest()
+
+
+def _digest(recording: Path) -> str:
+    files = sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
+    digest = hashlib.sha256(f"{len(files)}\n".encode())
+    for file in files:
+        with file.open("rb") as opened:
+            digest.update(hashlib.file_digest(opened, "sha256").digest())
     return digest.hexdigest()
 
 
@@ -40,14 +54,29 @@ def claim(data: Path, digest: str) -> None:
     if data.exists() and not data.is_dir():
         raise InvalidInput("DATA", "a folder, new or empty, after the recordings", data)
     if mark.is_file():
-        if json.loads(mark.read_text(encoding="utf-8"))["digest"] != digest:
+        if json.loads(mark.read_text(encoding="utf-8"))["digest"] == digest:
+            return
+        if any(file.name != CLAIM for file in mark.parent.iterdir()):
             other = "it holds that of other recordings, or of another version of msdgs"
             raise InvalidInput("DATA", "a new folder, or that of an earlier capture of the same", f"{data}: {other}")
-        return
-    if data.is_dir() and any(data.iterdir()):
+    elif data.is_dir() and any(data.iterdir()):
         raise InvalidInput("DATA", "a new or empty folder", f"{data}, which holds other files")
     mark.parent.mkdir(parents=True, exist_ok=True)
     write_text(mark, json.dumps({"digest": digest}) + "\n")
+
+
+@contextmanager
+def held(data: Path) -> Iterator[None]:
+    """Keep other processes from capturing into a folder. Raises `InvalidInput` if one does already."""
+    folder = os.open(data / WORK, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InvalidInput("DATA", "a folder into which no other process captures", data) from None
+        yield
+    finally:
+        os.close(folder)
 
 
 def required_bytes(recordings: Sequence[Path], frames: int, size: int) -> int:

@@ -35,7 +35,7 @@ MOVE = "walk around the subject, so that the camera itself moves sideways, by 20
 
 TEXTURE = "move slower, in more light, and keep surfaces with texture that stand still in view"
 
-CLOSER = "place the cameras closer to each other, so that neighbours see the same surfaces with texture"
+CLOSER = "place the cameras closer to each other, so that neighbors see the same surfaces with texture"
 
 
 @dataclass(frozen=True)

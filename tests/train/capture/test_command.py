@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from msdgs_serve.process import EXIT_INVALID
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.capture import job as job_module
 from msdgs_train.capture import recordings as recordings_module
-from msdgs_train.capture.recordings import claim, digest_of
+from msdgs_train.capture.errors import CaptureFailed
+from msdgs_train.capture.recordings import claim, digest_of, held
 from msdgs_train.cli.capture import Capture
 from msdgs_train.cli.main import _parse, main
 from msdgs_train.datasets import load_scene
@@ -128,9 +130,36 @@ def test_digests_follow_contents_and_order_and_not_names(tmp_path: Path):
     moved.parent.mkdir()
     shutil.copy(one, moved)
     assert digest_of([moved, other]) == digest_of([one, other])
-    assert digest_of([moved.parent]) != digest_of([moved.parent, moved.parent])
+    folder = tmp_path / "two"
+    folder.mkdir()
+    for file in (one, other):
+        shutil.copy(file, folder)
+    assert digest_of([folder]) != digest_of([one, other])
+    with pytest.raises(CaptureFailed, match=r"c\.mp4: is the same recording as .*a\.mp4"):
+        digest_of([one, other, moved])
     claim(tmp_path / "data", digest_of([one]))
     claim(tmp_path / "data", digest_of([moved]))
+
+
+def test_a_folder_in_which_nothing_was_captured_is_free_for_other_recordings(tmp_path: Path):
+    data = tmp_path / "data"
+    claim(data, "one")
+    claim(data, "other")
+    (data / "capture" / "frames").mkdir()
+    with pytest.raises(InvalidInput, match="other recordings"):
+        claim(data, "one")
+
+
+def test_two_captures_into_one_folder_at_once_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    clip = write_clip(tmp_path / "clip.mp4", pictures(4))
+    data = tmp_path / "data"
+    claim(data, digest_of([clip]))
+    with held(data):
+        assert main(["capture", str(clip), str(data)]) == EXIT_INVALID
+    assert "a folder into which no other process captures" in capsys.readouterr().err
+    assert [path.name for path in (data / "capture").iterdir()] == ["recordings.json"]
+    with held(data):
+        pass
 
 
 def test_a_full_disk_is_told_before_it_starts(
@@ -158,6 +187,12 @@ def test_a_full_disk_is_told_before_it_starts(
         (["missing.mp4", "data"], "missing.mp4"),
         (["clip.mp4", "data", "--frames", "0"], "`frames`"),
         (["clip.mp4", "data", "--size", "-1"], "`size`"),
+        (["clip.mp4", "data", "--size", "1"], "`size`"),
+        (["clip.mp4", "data", "--seed", "-1"], "`seed`"),
+        (["clip.mp4", "data", "--seed", str(2**31)], "`seed`"),
+        (["clip.mp4", "data", "--threads", "0"], "`threads`"),
+        (["clip.mp4", "data", "--offsets", "0", "0.1"], "`offsets` must be one finite number for each recording, 1"),
+        (["clip.mp4", "clip.mp4", "data"], "is the same recording as clip.mp4"),
     ],
 )
 def test_wrong_arguments_are_named(

@@ -159,7 +159,7 @@ def test_cameras_have_frames_at_the_same_moments(tmp_path: Path):
 def test_offsets_are_one_a_video(tmp_path: Path):
     clip = write_clip(tmp_path / "clip.mp4", pictures(2))
     for offsets in ([0.0], [0.0, float("nan")], [0.0, 0.1, 0.2]):
-        with pytest.raises(InvalidInput, match="`offsets` must be 2 finite numbers, one a video"):
+        with pytest.raises(InvalidInput, match="`offsets` must be one finite number for each recording, 2"):
             extract_frames([clip, clip], tmp_path / "out", offsets=offsets)
 
 

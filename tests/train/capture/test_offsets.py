@@ -72,7 +72,7 @@ def test_unrelated_sounds_and_silence_give_equal_starts_and_it_is_said(tmp_path:
     found = find_offsets(videos)
     assert not found.are_heard
     assert found.seconds == (0.0,) * 4
-    assert "mute.mp4, still.mp4 has no sound" in found.note
+    assert "no sound in mute.mp4, still.mp4" in found.note
 
 
 def test_clocks_that_differ_a_little_do_no_harm(tmp_path: Path):
