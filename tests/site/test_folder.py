@@ -146,6 +146,10 @@ def test_names_of_files_are_text(tmp_path: Path, scene: Path, runtime: Path):
         assert page.texts["title"] == named.stem.encode("utf-8", "replace").decode()
 
 
+def test_without_scripts_it_says_that_it_needs_them(site: Path):
+    assert page_of(site).texts["noscript"] == "This page needs JavaScript."
+
+
 def test_titles_are_one_line(tmp_path: Path, scene: Path, runtime: Path):
     for title, shown in (("a\nb\t c\n", "a b c"), (" ", scene.stem), ("a\udcff", "a?")):
         assert page_of(write_site(scene, tmp_path / "site", runtime, title=title)).texts["title"] == shown
