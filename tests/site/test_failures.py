@@ -54,6 +54,18 @@ def no_runtime(site: Path) -> None:
     shutil.rmtree(site / "onnxruntime-web")
 
 
+def no_module(site: Path) -> None:
+    (site / "viewer" / "camera.js").unlink()
+
+
+def no_pose_worker(site: Path) -> None:
+    (site / "viewer" / "local" / "pose_worker.js").unlink()
+
+
+def no_sort_worker(site: Path) -> None:
+    (site / "viewer" / "local" / "sort_worker.js").unlink()
+
+
 def no_description(site: Path) -> None:
     (site / "scene.json").unlink()
 
@@ -73,6 +85,9 @@ def half_a_description(site: Path) -> None:
         (another_scene, f"The scene’s file {SCENE} isn’t the one that this page was written for"),
         (same_size, f"The scene’s file {SCENE} isn’t the one that this page was written for"),
         (no_runtime, "onnxruntime-web can’t be loaded"),
+        (no_module, "A file of this page is missing below viewer/"),
+        (no_pose_worker, "can’t be loaded"),
+        (no_sort_worker, "can’t be loaded"),
         (no_description, "The file scene.json can’t be loaded: the server answered 404."),
         (half_a_description, "The file scene.json isn’t the one that was written for this page."),
     ],

@@ -146,6 +146,15 @@ def test_names_of_files_are_text(tmp_path: Path, scene: Path, runtime: Path):
         assert page.texts["title"] == named.stem.encode("utf-8", "replace").decode()
 
 
+def test_without_scripts_it_says_that_it_needs_them(site: Path):
+    assert page_of(site).texts["noscript"] == "This page needs JavaScript."
+
+
+def test_titles_are_one_line(tmp_path: Path, scene: Path, runtime: Path):
+    for title, shown in (("a\nb\t c\n", "a b c"), (" ", scene.stem), ("a\udcff", "a?")):
+        assert page_of(write_site(scene, tmp_path / "site", runtime, title=title)).texts["title"] == shown
+
+
 def test_the_policy_admits_only_the_folder(site: Path):
     tag, attributes = page_of(site).elements[3]
     assert (tag, attributes["content"]) == ("meta", POLICY), "before anything that it concerns"
@@ -170,6 +179,7 @@ def test_links_to_it_show_a_picture_if_its_address_is_known(tmp_path: Path, scen
         ("https://example.org/a%20b/", "https://example.org/a%20b/"),
         ('https://user.github.io/é/"x"', "https://user.github.io/%C3%A9/%22x%22/"),
         ("http://[::1]:80", "http://[::1]:80/"),
+        ("https://example.org/\udcff", "https://example.org/%FF/"),
     ],
 )
 def test_addresses_are_those_of_the_folder(url: str, folder: str):
@@ -189,6 +199,7 @@ def test_addresses_are_those_of_the_folder(url: str, folder: str):
         "https://a b/",
         'https://a"/',
         "https://[::1 /",
+        "https://a\udcff/",
     ],
 )
 def test_other_addresses_are_refused(tmp_path: Path, scene: Path, runtime: Path, url: str):
@@ -217,6 +228,16 @@ def test_it_replaces_a_site_and_nothing_else(tmp_path: Path, scene: Path, runtim
     (tmp_path / "file").write_text("text")
     with pytest.raises(InvalidInput, match="a folder"):
         write_site(scene, tmp_path / "file", runtime)
+
+
+def test_folders_that_cannot_be_replaced_are_refused(
+    tmp_path: Path, scene: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    for out in (Path(), tmp_path, Path("/")):
+        with pytest.raises(InvalidInput, match="replaced as a whole"):
+            write_site(scene, out, runtime)
+    assert set(tmp_path.iterdir()) == {runtime}
 
 
 def test_an_interrupted_one_leaves_the_old_one(scene: Path, runtime: Path, site: Path, monkeypatch: pytest.MonkeyPatch):
@@ -252,6 +273,12 @@ def test_one_that_cannot_take_its_place_leaves_the_old_one(
         with pytest.raises(KeyboardInterrupt):
             write_site(scene, site, runtime, title="New")
     assert page_of(site).texts["title"] == "balls"
+
+
+def test_it_tells_the_address_of_folders_whose_names_are_no_text(tmp_path: Path, scene: Path, runtime: Path):
+    told = StringIO()
+    write_site(scene, tmp_path / "a\udcff", runtime, Console(file=told, soft_wrap=True))
+    assert 'src="a%FF/"' in told.getvalue()
 
 
 def test_it_tells_how_to_look_at_it(tmp_path: Path, scene: Path, runtime: Path):

@@ -64,22 +64,25 @@ def write_site(session: DeformationSession, options: ConvertOptions, console: Co
 
 
 def _text(session: DeformationSession, options: ConvertOptions) -> PageText:
-    title = _printable(options.title or options.scene.stem)
+    title = _printable(options.title or "") or _printable(options.scene.stem)
     moves = "A moving scene" if session.scene.changes else "A scene"
     description = f"{moves} of {len(session.scene):,} Gaussians, to look at from all sides."
     url = None if options.url is None else folder_url(options.url)
-    return PageText(title, _printable(options.description or description), url)
+    return PageText(title, _printable(options.description or "") or description, url)
 
 
 def _printable(text: str) -> str:
-    """Text in which bytes of file names that are no text are replaced."""
-    return text.encode("utf-8", "replace").decode()
+    """Text in one line, in which bytes of arguments and file names that are no text are replaced."""
+    return " ".join(text.encode("utf-8", "replace").decode().split())
 
 
 def _check_replaceable(out: Path) -> None:
     """Raise `InvalidInput` if `out` is a file, or a folder with anything but a site."""
     if out.exists() and not out.is_dir():
         raise InvalidInput("out", "a folder", str(out))
+    if out.is_dir() and (out.is_mount() or out.samefile(Path.cwd())):
+        found = f"{out}, which is the current folder or a mount point"
+        raise InvalidInput("out", "a folder that can be replaced as a whole", found)
     if not out.is_dir() or not any(out.iterdir()):
         return
     try:

@@ -15,7 +15,7 @@ POLICY = (
     "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'"
 )
-ADDRESS = re.compile(r"""(?P<host>https?://[^\s/?#"'<>\\]+)(?P<path>(/[^?#]*)?)""", re.IGNORECASE)
+ADDRESS = re.compile(r"""(?P<host>https?://[^\s/?#"'<>\\\ud800-\udfff]+)(?P<path>(/[^?#]*)?)""", re.IGNORECASE)
 OF_SERVICE = re.compile(r" *<!-- service -->\n.*?<!-- /service -->\n", re.DOTALL)
 
 
@@ -34,7 +34,7 @@ def folder_url(url: str) -> str:
     if match is None:
         raise InvalidInput("url", "the address of the folder, such as https://example.org/toys/", url)
     path = match["path"].removesuffix("index.html").rstrip("/") + "/"
-    return match["host"] + quote(path, safe="/%~+,;=:@")
+    return match["host"] + quote(path, safe="/%~+,;=:@", errors="surrogateescape")
 
 
 def site_page(viewer_page: str, text: PageText) -> str:
@@ -82,7 +82,7 @@ def _tags(text: PageText) -> list[tuple[str, str, str]]:
 
 def iframe(text: PageText, folder: str) -> str:
     """The line of HTML that shows a site in another page; `folder` is its address if the text has none."""
-    address = escape(text.url or f"{quote(folder)}/")
+    address = escape(text.url or f"{quote(folder, errors='surrogateescape')}/")
     return (
         f'<iframe src="{address}" title="{escape(text.title)}" width="800" height="600" style="border: 0" '
         'allow="fullscreen" loading="lazy"></iframe>'

@@ -25,7 +25,7 @@ class RuntimeMissing(MsdgsError):
 
     def __init__(self, reason: str) -> None:
         super().__init__(
-            f"{RUNTIME} {VERSION}, which draws the scene in browsers, can't be fetched: {reason}. Where npm works, run "
+            f"{RUNTIME} {VERSION}, which poses the scene in browsers, can't be fetched: {reason}. Where npm works, run "
             f"`npm install --ignore-scripts --prefix DIR {RUNTIME}@{VERSION}`, then give "
             f"--onnxruntime-web DIR/node_modules/{RUNTIME}"
         )

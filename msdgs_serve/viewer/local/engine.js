@@ -8,6 +8,7 @@ import { NEAR_PLANE } from "./shaders.js";
 
 export { CHANNELS };
 
+const MISSING = "A part of the page can’t be loaded."; // of a worker whose file isn’t there
 const STATIC = { first: { slot: 0 }, second: { slot: 0 }, share: 0, isExact: true };
 
 /**
@@ -42,7 +43,7 @@ const worker = (name) => new Worker(new URL(name, import.meta.url), { type: "mod
 /** Send a message to the worker that poses, and return its answer. */
 function answerOf(poser, message, onProgress = () => {}) {
   return new Promise((resolve, reject) => {
-    poser.onerror = ({ message: text }) => reject(new Error(text || "A part of the page can’t be loaded."));
+    poser.onerror = ({ message: text }) => reject(new Error(text || MISSING));
     poser.onmessage = ({ data }) => {
       if (data.kind === "progress") onProgress({ loaded: data.loaded, total: data.total });
       else if (data.kind === "failed") reject(new Error(data.message));
@@ -83,9 +84,9 @@ class Engine {
     const interpolates = !metadata.plan.startsWith("frames:"); // whose Gaussians are replaced, not moved
     this.#poses = new Poses({ interpolates, range: metadata.time_range }, (pose) => this.#pose(pose));
     this.#poser.onmessage = ({ data }) => this.#takeAnswer(data);
-    this.#poser.onerror = ({ message }) => onError(new Error(message));
+    this.#poser.onerror = ({ message }) => onError(new Error(message || MISSING));
     this.#sorter.onmessage = ({ data }) => this.#takeOrder(data);
-    this.#sorter.onerror = ({ message }) => onError(new Error(message));
+    this.#sorter.onerror = ({ message }) => onError(new Error(message || MISSING));
     this.#canvas.addEventListener("webglcontextlost", this.#lost);
     this.#canvas.addEventListener("webglcontextrestored", this.#restored);
     const { means } = constants;

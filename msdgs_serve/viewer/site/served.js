@@ -1,5 +1,11 @@
-// Says why nothing happens if the page was opened as a file: browsers load no modules then.
+// Says why nothing happens if the page was opened as a file, from which browsers load no modules, or if one is missing.
 
+document.querySelector("script[type=module]").addEventListener("error", () => {
+  if (location.protocol === "file:") return;
+  const banner = document.getElementById("banner");
+  banner.textContent = "A file of this page is missing below viewer/: the folder has to be copied as a whole.";
+  banner.hidden = false;
+});
 if (location.protocol === "file:") {
   const folder = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "");
   const banner = document.getElementById("banner");
