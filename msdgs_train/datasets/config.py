@@ -21,7 +21,7 @@ class DataConfig(Checked):
     time_from: Annotated[str | None, optional("{names,index,none,REGEX}")] = None
     """Times of the images: `names` takes the number, date or clock in the files' names that varies with time; `index`
     their order; `none` is a scene that stands still; a regular expression has the time as its group, such as
-    'frame_(\\d+)'. The dataset's own times if not given, `names` for COLMAP."""
+    'frame_(\\d+)'. The dataset's own times if not given; for COLMAP those of `times.json`, or else `names`."""
     masks: bool = True
     """Whether pixels that a dataset's masks hide (black in the mask) are left out of the loss and of evaluations."""
     background: Literal["white", "black", "random"] = "white"
