@@ -43,6 +43,7 @@ def extract_frames(
             raise InvalidInput(name, "1 or more", value)
     offsets = starts(inputs, offsets)
     sources = [open_source(file, size) for file in inputs]
+    _require_common_moments(sources, offsets)
     step = max(source.duration + source.period for source in sources) / frames
     ticker = _Ticker(sum(source.count for source in sources), progress)
     selections: list[Selection] = []
@@ -78,6 +79,16 @@ def starts(inputs: Sequence[Path], offsets: Sequence[float] | None) -> list[floa
     if len(offsets) != len(inputs) or not np.isfinite(offsets).all():
         raise InvalidInput("offsets", f"one finite number for each recording, {len(inputs)}", list(offsets))
     return [offset - offsets[0] for offset in offsets]
+
+
+def _require_common_moments(sources: Sequence[Source], starts: Sequence[float]) -> None:
+    """Raise `InvalidInput` if a recording shows no moment that another one shows."""
+    spans = [(start, start + source.duration) for source, start in zip(sources, starts, strict=True)]
+    for index, (first, last) in enumerate(spans):
+        others = spans[:index] + spans[index + 1 :]
+        if others and all(last < start or first > end for start, end in others):
+            expected = "seconds by which recordings begin after the first one, but no other one shows a moment of "
+            raise InvalidInput("offsets", f"{expected}recording {index + 1}", list(starts))
 
 
 def _moments(source: Source, start: float, frames: int, step: float, first: Selection | None) -> Intervals | Moments:

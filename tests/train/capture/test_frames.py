@@ -178,3 +178,11 @@ def test_frames_and_size_are_positive(tmp_path: Path):
         extract_frames([clip], tmp_path / "out", frames=0)
     with pytest.raises(CaptureFailed, match=r"none\.mp4: does not exist"):
         extract_frames([tmp_path / "none.mp4"], tmp_path / "out")
+
+
+@pytest.mark.parametrize("offset", [0.4, -0.4, 400.0, 1e9])
+def test_recordings_without_a_common_moment_are_refused(tmp_path: Path, offset: float):
+    clips = [write_clip(tmp_path / f"{name}.mp4", pictures(4)) for name in ("one", "two")]
+    with pytest.raises(InvalidInput, match=r"`offsets` must be seconds .* no other one shows a moment of recording 1"):
+        extract_frames(clips, tmp_path / "out", offsets=[0.0, offset])
+    assert not (tmp_path / "out").exists()
