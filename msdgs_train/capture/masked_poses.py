@@ -44,8 +44,9 @@ def find_masked_poses(
 ) -> MaskedPoses:
     """Find poses and masks, each pass without the features that the last one found moving.
 
-    A pass is kept if more frames have a pose, or as many at a smaller error or with more points seen; the masks are those
-    that its poses were found with. `keep` runs the steps, or takes their earlier results. Arguments and errors are those of `find_poses`.
+    A pass is kept if more frames have a pose, or as many at a smaller error or with more points seen; the masks are
+    those that its poses were found with. `keep` runs the steps, or takes their earlier results. Arguments and errors
+    are those of `find_poses`.
     """
 
     def find(number: int, masks: Path | None) -> Poses:
