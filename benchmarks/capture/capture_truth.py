@@ -68,7 +68,7 @@ def main(
     made = table(f"{frames} frames of {width} px, seed {seed}, {threads} thread(s)", *COLUMNS)
     with scratch_folder() as folder:
         if "moving" in parts:
-            clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=60.0, seed=seed)
+            clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=30.0, seed=seed)
             share = f"{clip.moving.mean():.0%} moves"
             for name, found, taken in _with_and_without(clip.file, folder / "clip", seed, threads):
                 made.add_row(f"moving camera, {share}, {name}", *_row(found, taken, clip.camera_to_world, clip.times))

@@ -13,7 +13,7 @@ from msdgs_train.capture.poses import Poses, find_poses
 PASSES = 3
 """At most, with masks."""
 GAIN = 0.03
-"""Part by which the error must fall for another pass."""
+"""Part by which the error must fall, or the observations of points rise, for another pass."""
 MASKS, MOVING = "masks", "moving.json"
 
 Progress = Callable[[str, int, int], None]
@@ -44,8 +44,9 @@ def find_masked_poses(
 ) -> MaskedPoses:
     """Find poses and masks, each pass without the features that the last one found moving.
 
-    A pass is kept if more frames have a pose, or as many at a smaller error; the masks are those that its poses were
-    found with. `keep` runs the steps, or takes their earlier results. Arguments and errors are those of `find_poses`.
+    A pass is kept if more frames have a pose, or as many at a smaller error or with more points seen; the masks are
+    those that its poses were found with. `keep` runs the steps, or takes their earlier results. Arguments and errors
+    are those of `find_poses`.
     """
 
     def find(number: int, masks: Path | None) -> Poses:
@@ -70,10 +71,9 @@ def find_masked_poses(
         if not _is_better(again, poses):
             break
         passes += 1
-        registers_more = len(again.registered) > len(poses.registered)
-        gains = again.summary.error < (1 - GAIN) * poses.summary.error
+        goes_on = _is_better(again, poses, GAIN)
         poses = again
-        if not (registers_more or gains):
+        if not goes_on:
             break
         masks, moving = mask(passes, poses)
     return MaskedPoses(poses, masks, moving, passes)
@@ -83,6 +83,10 @@ def _suffix(number: int) -> str:
     return f"-{number + 1}" if number else ""
 
 
-def _is_better(one: Poses, other: Poses) -> bool:
-    rank = len(other.registered) - len(one.registered), one.summary.error - other.summary.error
-    return rank < (0, 0.0)
+def _is_better(one: Poses, other: Poses, gain: float = 0.0) -> bool:
+    """Whether more frames have a pose, or as many at an error smaller by this part, or clearly more
+    observations: wrong poses may have a small error, of the few points that agree with them."""
+    if len(one.registered) != len(other.registered):
+        return len(one.registered) > len(other.registered)
+    sees_more = len(one.summary.observations) > (1 + GAIN) * len(other.summary.observations)
+    return sees_more or one.summary.error < (1 - gain) * other.summary.error

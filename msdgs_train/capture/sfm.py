@@ -170,6 +170,7 @@ def _global(job: PosesJob, database: Path, scratch: Path) -> list[pycolmap.Recon
     options.mapper.rotation_averaging.random_seed = job.seed
     options.mapper.global_positioning.random_seed = job.seed
     options.mapper.retriangulation.random_seed = job.seed
+    options.mapper.bundle_adjustment.ceres.solver_options.num_threads = job.threads
     return _sorted(pycolmap.global_mapping(database, scratch, scratch, options))
 
 
