@@ -132,7 +132,7 @@ class GaussianSplatting:
             "model": self.model.state_dict(),
             "average": self.average.state(),
             "density": self.density.state(),
-            "poses": self.poses.state_dict() if self.poses else None,
+            **({"poses": self.poses.state_dict()} if self.poses else {}),
         }
 
     def load_state(self, state: dict[str, Any], step: int) -> None:

@@ -99,11 +99,15 @@ def test_the_installed_commands_exist(name: str):
 
 @pytest.mark.parametrize("number", STOPPING)
 def test_signals_that_stop_a_command_are_handled_in_a_block(number: signal.Signals):
-    received, before = [], {each: signal.getsignal(each) for each in STOPPING}
-    with stopped_by(lambda number, frame: received.append(number)):
-        os.kill(os.getpid(), number)
-    assert received == [number]
-    assert {each: signal.getsignal(each) for each in STOPPING} == before
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup ignores it
+    try:
+        received, before = [], {each: signal.getsignal(each) for each in STOPPING}
+        with stopped_by(lambda number, frame: received.append(number)):
+            os.kill(os.getpid(), number)
+        assert received == [number]
+        assert {each: signal.getsignal(each) for each in STOPPING} == before
+    finally:
+        signal.signal(signal.SIGHUP, inherited)
 
 
 def test_a_terminal_that_is_closed_is_ignored_if_it_was():
