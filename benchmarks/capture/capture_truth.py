@@ -36,8 +36,8 @@ class Errors(NamedTuple):
 
 def main(
     parts: tuple[Part, ...] = ("moving", "fixed"),
-    frames: int = 72,
-    width: int = 448,
+    frames: int = 36,
+    width: int = 320,
     rig_frames: int = 16,
     threads: int = 1,
     seed: int = 0,
