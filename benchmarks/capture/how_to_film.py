@@ -42,7 +42,7 @@ def main() -> None:
             place.set(xticks=[], yticks=[])
             place.set_title(f"frame {index + 1} of {len(poses)}", fontsize=9)
         with replacing(out / f"film_{name}.webp") as temporary:
-            figure.savefig(temporary, format="webp", pil_kwargs={"quality": 80})
+            figure.savefig(temporary, format="webp", bbox_inches="tight", pad_inches=0.05, pil_kwargs={"quality": 80})
 
 
 def draw_above(place: Axes, title: str, color: str, poses: list[np.ndarray]) -> None:
@@ -57,7 +57,7 @@ def draw_above(place: Axes, title: str, color: str, poses: list[np.ndarray]) -> 
     path = np.array([pose[:2, 3] for pose in poses])
     place.plot(*path.T, color=color, linewidth=1)
     place.set(xlim=(-1.9, 1.9), ylim=(-2.4, 1.1), aspect="equal")
-    place.set_title(title, fontsize=10, color=color, weight="bold", y=0.9)
+    place.set_title(title, fontsize=10, color=color, weight="bold")
     place.axis("off")
 
 
