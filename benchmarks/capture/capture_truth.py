@@ -15,9 +15,10 @@ from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.frames import extract_frames
-from msdgs_train.capture.masked_poses import Keep, Progress, find_masked_poses, step_names
+from msdgs_train.capture.masked_poses import Keep, find_masked_poses, step_names
 from msdgs_train.capture.offsets import find_offsets
 from msdgs_train.capture.poses import Poses, find_poses
+from msdgs_train.capture.progress import Progress
 from tests.support.clips import Clip, fixed_camera_clips, moving_camera_clip
 
 OFFSETS = (0.0, 0.08, 0.16, 0.24, 0.32, 0.4)  # seconds

@@ -10,7 +10,6 @@ loss, and what moves must count.
 """
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -20,6 +19,7 @@ from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.image_files import read_color, read_gray, write_image
 from msdgs_train.capture.poses import Poses
+from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.sfm_process import UndistortedJob, run_sfm
 from msdgs_train.datasets.colmap.binary import read_cameras, read_images
 from msdgs_train.datasets.colmap.loader import IMAGES, SPARSE
@@ -38,7 +38,7 @@ def write_dataset(
     masks: Path | None,
     out: Path,
     *,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> None:
     """Write the frames that have a pose, and their masks, to the folder `out`; it loses what such a call wrote before.
 

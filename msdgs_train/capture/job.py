@@ -13,9 +13,10 @@ from msdgs_train.capture.frames import extract_frames, starts
 from msdgs_train.capture.masked_poses import MaskedPoses, find_masked_poses, step_names
 from msdgs_train.capture.measures import measure_frames, measure_poses
 from msdgs_train.capture.offsets import find_offsets
+from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.recordings import WORK, claim, digest_of, held, require_disk, required_bytes
 from msdgs_train.capture.report import Report, write_report
-from msdgs_train.capture.steps import Progress, Steps, Watch
+from msdgs_train.capture.steps import Steps, Watch
 from msdgs_train.capture.verdict import Verdict, judge, judge_frames
 
 STEPS: dict[str, tuple[str, ...]] = {

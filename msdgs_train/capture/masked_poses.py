@@ -9,6 +9,7 @@ from msdgs_serve.writing import write_text
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.moving import find_moving
 from msdgs_train.capture.poses import Poses, find_poses
+from msdgs_train.capture.progress import Progress
 
 PASSES = 3
 """At most, with masks."""
@@ -16,8 +17,6 @@ GAIN = 0.03
 """Part by which the error must fall, or the observations of points rise, for another pass."""
 MASKS, MOVING = "masks", "moving.json"
 
-Progress = Callable[[str, int, int], None]
-"""Called with the stage, what is done and the total."""
 Keep = Callable[[str, Callable[[Path, Progress], None]], Path]
 """Makes the result of a step of this name by a function that fills a folder, unless it is there; returns its folder."""
 

@@ -16,6 +16,7 @@ from msdgs_train.capture.fixed_cameras import background
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.image_files import read_color, read_gray, write_image
 from msdgs_train.capture.poses import Poses
+from msdgs_train.capture.progress import Progress
 
 WORKING_SIZE = 384
 """Long side in pixels at which flow is computed; distances below are in these pixels."""
@@ -54,7 +55,7 @@ def find_moving(
     poses: Poses,
     out: Path,
     *,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> dict[str, float]:
     """Write a mask of each frame's name and size to the folder `out`, white where something moves.
 

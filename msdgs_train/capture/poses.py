@@ -4,13 +4,13 @@ A moving camera has a view for each of its frames. The frames of a camera that s
 the background, the median of its frames, which is free of what moves. Views of one camera share its intrinsics.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from msdgs_train.capture.fixed_cameras import background, is_fixed
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.image_files import read_gray, write_image
+from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, run_sfm
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 from msdgs_train.capture.views import View, matched_pairs
@@ -52,7 +52,7 @@ def find_poses(
     masks: Path | None = None,
     seed: int = 0,
     threads: int | None = None,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Poses:
     """Find the poses of frames in the folder `images`; `workspace` takes the database, the model and `geometry.npz`.
 

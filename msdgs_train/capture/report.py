@@ -19,8 +19,8 @@ from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.image_files import read_color, read_gray
 from msdgs_train.capture.masked_poses import MaskedPoses
 from msdgs_train.capture.measures import Measures
+from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.sparse_model import Summary
-from msdgs_train.capture.steps import Progress
 from msdgs_train.capture.verdict import Verdict
 
 SHOWN = 24

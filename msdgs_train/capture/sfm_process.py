@@ -9,18 +9,15 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 from msdgs_train.capture.errors import CaptureFailed
+from msdgs_train.capture.progress import Progress
 
 PROGRAM = "msdgs_train.capture.sfm"
 LAST_LINES = 3
-
-Progress = Callable[[str, int, int], None]
-"""Called with the name of a stage, what is done and the total."""
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from msdgs_serve.writing import temporary_folder, write_text
-
-Progress = Callable[[str, int, int], None]
-"""Called with the stage of a step, what is done and the total."""
+from msdgs_train.capture.progress import Progress
 
 Watch = Callable[[str, bool], AbstractContextManager[Progress]]
 """Called with the name of a step and whether its result is kept from an earlier run."""

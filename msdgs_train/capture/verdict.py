@@ -1,7 +1,7 @@
 """What a capture is worth, in words: good, or what to record differently.
 
-The limits are where scenes of known truth stop being found, or found well: `python -m benchmarks.capture.verdicts`,
-docs/your_scene.md.
+The limits of rotation and parallax are where scenes of known truth stop being found, or found well:
+`python -m benchmarks.capture.verdicts`, docs/your_scene.md. The others are chosen.
 """
 
 from collections.abc import Iterator

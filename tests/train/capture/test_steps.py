@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from msdgs_train.capture.steps import Progress, Steps
+from msdgs_train.capture.progress import Progress
+from msdgs_train.capture.steps import Steps
 
 RESULTS = {"frames": (), "poses": (), "dataset": ("images", "sparse"), "report": ("capture.html",)}
 
