@@ -15,6 +15,7 @@ from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import orbit
 from tests.support.images import decode
 from tests.support.processes import ROOT, WEBGL, chromium
+from tests.support.sites import MODULES, RUNTIME
 
 HERE = Path(__file__).parent
 PACKAGES = HERE / "node_modules"
@@ -58,12 +59,14 @@ class Drawn(NamedTuple):
 @contextlib.contextmanager
 def pages(folder: Path) -> Iterator[tuple[Browser, str]]:
     """A browser, and the address of a server for the pages and the files of `folder`."""
-    if not PACKAGES.is_dir():
-        name = PACKAGES.relative_to(ROOT)
-        raise SystemExit(f"no {name}: `make {name}` fetches the renderers to compare with")
+    for fetched in (PACKAGES, MODULES):
+        if not fetched.is_dir():
+            name = fetched.relative_to(ROOT)
+            raise SystemExit(f"no {name}: `make {name}` fetches what the pages load")
     folders = {
         "pages": HERE / "pages",
         "packages": PACKAGES,
+        "runtime": RUNTIME,
         "viewer": ROOT / "msdgs_serve" / "viewer",
         "files": folder,
     }

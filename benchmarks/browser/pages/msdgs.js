@@ -1,6 +1,6 @@
 import { openEngine } from "/viewer/local/engine.js";
 
-const DIST = "/packages/onnxruntime-web/dist/";
+const DIST = "/runtime/dist/";
 const RUNTIME = {
   module: `${DIST}ort.wasm.min.mjs`,
   glue: `${DIST}ort-wasm-simd-threaded.mjs`,
