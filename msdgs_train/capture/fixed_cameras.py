@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from msdgs_train.capture.image_files import read_color, read_gray
+from msdgs_train.capture.views import spread
 
 CORNERS, CORNER_QUALITY, CORNER_DISTANCE = 300, 0.02, 7
 STILL = 0.002
@@ -37,12 +38,6 @@ def background(files: Sequence[Path]) -> np.ndarray:
     """[H, W, 3] uint8, BGR: the median of images of a fixed camera, without what passes through them."""
     images = np.stack([read_color(file) for file in spread(files, BACKGROUND)])
     return np.median(images, axis=0).astype(np.uint8)
-
-
-def spread(files: Sequence[Path], count: int) -> list[Path]:
-    """At most `count` of the files, at even distances, with the first and the last."""
-    chosen = np.linspace(0, len(files) - 1, min(count, len(files))).round().astype(int)
-    return [files[index] for index in chosen]
 
 
 def _still_part(first: np.ndarray, other: np.ndarray, corners: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 import base64
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
@@ -14,7 +14,6 @@ import numpy as np
 
 from msdgs_serve.writing import write_text
 from msdgs_train.capture.figures import draw_parallax, draw_path
-from msdgs_train.capture.fixed_cameras import spread
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.image_files import read_color, read_gray
 from msdgs_train.capture.masked_poses import MaskedPoses
@@ -22,6 +21,7 @@ from msdgs_train.capture.measures import Measures
 from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.sparse_model import Summary
 from msdgs_train.capture.verdict import Verdict
+from msdgs_train.capture.views import spread
 
 SHOWN = 24
 """Frames on the contact sheet."""
@@ -134,18 +134,18 @@ def _section(title: str, drawing: str) -> str:
 
 
 def _sheet(report: Report, progress: Progress) -> Iterator[str]:
-    names: Sequence[Path] = spread([Path(frame.name) for frame in report.frames.frames], SHOWN)
-    times = {frame.name: frame.time for frame in report.frames.frames}
-    for done, name in enumerate(map(Path.as_posix, names), start=1):
+    frames = spread(report.frames.frames, SHOWN)
+    for done, frame in enumerate(frames, start=1):
+        name = frame.name
         coded = base64.b64encode(
             _thumbnail(report.images / name, report.found.masks / name if report.found else None)
         ).decode()
-        caption = f"{times[name]:.2f} s" + (f", {report.moving[name]:.0%} moves" if name in report.moving else "")
+        caption = f"{frame.time:.2f} s" + (f", {report.moving[name]:.0%} moves" if name in report.moving else "")
         yield (
             f'<figure><img alt="{escape(name)}" src="data:image/jpeg;base64,{coded}">'
             f"<figcaption>{escape(caption)}</figcaption></figure>"
         )
-        progress("pictures", done, len(names))
+        progress("pictures", done, len(frames))
 
 
 def _thumbnail(image: Path, mask: Path | None) -> bytes:

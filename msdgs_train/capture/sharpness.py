@@ -10,6 +10,8 @@ from functools import cache
 
 import numpy as np
 
+from msdgs_train.capture.pictures import fitted
+
 FINE = 0.8
 """Standard deviation in pixels of the Gaussian before gradients are taken."""
 COARSE = 64
@@ -45,9 +47,7 @@ def thumbnail(grey: np.ndarray, side: int = COARSE) -> np.ndarray:
     import cv2
 
     height, width = grey.shape
-    scale = min(1.0, side / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(grey.astype(np.float32), fitted(width, height, side), interpolation=cv2.INTER_AREA)
 
 
 def _structure(values: np.ndarray) -> np.ndarray:

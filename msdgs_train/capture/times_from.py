@@ -14,6 +14,7 @@ import numpy as np
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.image_source import ENDINGS, read_image
+from msdgs_train.capture.pictures import fitted
 from msdgs_train.capture.video_source import VideoSource
 from msdgs_train.datasets.colmap.loader import IMAGES, SPARSE
 from msdgs_train.datasets.common.images import EXTENSIONS
@@ -122,9 +123,9 @@ def _grey(file: Path) -> np.ndarray:
 
     pixels = read_image(file)
     height, width, _ = pixels.shape
-    scale = min(1.0, STORED / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.cvtColor(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    return cv2.cvtColor(
+        cv2.resize(pixels, fitted(width, height, STORED), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY
+    )
 
 
 def _cropped(grey: np.ndarray, crop: float, size: tuple[int, int]) -> np.ndarray:

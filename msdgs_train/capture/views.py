@@ -3,6 +3,9 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TypeVar
+
+T = TypeVar("T")
 
 OVERLAP = 10
 """Following frames that a frame is matched with; beyond them those at distances of powers of two."""
@@ -25,7 +28,7 @@ class View:
 
 
 def matched_pairs(views: Sequence[View]) -> list[tuple[str, str]]:
-    """Names of the views to match: neighbours, keyframes, and views of one time across cameras."""
+    """Names of the views to match: neighbors, keyframes, and views of one time across cameras."""
     cameras = [[view for view in views if view.camera == camera] for camera in sorted({view.camera for view in views})]
     pairs = [pair for own in cameras for pair in _own_pairs(own)]
     pairs += [pair for one, other in combinations(cameras, 2) for pair in _cross_pairs(one, other)]
@@ -38,17 +41,17 @@ def _own_pairs(views: Sequence[View]) -> Iterator[tuple[View, View]]:
         distances.append(1 << distances[-1].bit_length())
     for first, view in enumerate(views):
         yield from ((view, views[first + distance]) for distance in distances if first + distance < len(views))
-    yield from combinations(_spread(views, KEYFRAMES), 2)
+    yield from combinations(spread(views, KEYFRAMES), 2)
 
 
 def _cross_pairs(one: Sequence[View], other: Sequence[View]) -> Iterator[tuple[View, View]]:
     few, many = sorted((one, other), key=len)
-    for view in _spread(many, LINKS):
+    for view in spread(many, LINKS):
         yield view, min(few, key=lambda candidate: abs(candidate.time - view.time))
 
 
-def _spread(views: Sequence[View], count: int) -> list[View]:
-    """At most `count` of the views, at even distances, with the first and the last."""
-    if len(views) <= count:
-        return list(views)
-    return [views[round(index * (len(views) - 1) / (count - 1))] for index in range(count)]
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """At most `count` of the items, two or more, at even distances, with the first and the last."""
+    if len(items) <= count:
+        return list(items)
+    return [items[round(index * (len(items) - 1) / (count - 1))] for index in range(count)]
