@@ -35,6 +35,9 @@ class DensityConfig(Checked):
     grow_grad2d: float = 4e-4
     """gradient: Gaussians whose projected means have gradients of a larger mean norm, in normalized device coordinates,
     are densified."""
+    absolute_gradients: bool = False
+    """gradient: sum the absolute values of the pixels' gradients of a projected mean (AbsGS), so that those of opposite
+    sides of a large Gaussian don't cancel; --grow-grad2d is then about twice as large."""
     grow_scale3d: float = 0.01
     """gradient: of these, Gaussians larger than this fraction of the scene's scale are split, smaller ones cloned."""
     prune_opa: float = 0.005

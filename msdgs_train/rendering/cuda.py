@@ -15,6 +15,7 @@ def rasterize_cuda(
     background: Tensor,
     options: RasterizerOptions,
     info: RasterizationInfo,
+    absolute_gradients: bool,
 ) -> tuple[Tensor, Tensor]:
     """Return rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
     if options._replace(near_plane=GSPLAT.near_plane, eps2d=GSPLAT.eps2d) != GSPLAT:
@@ -35,9 +36,15 @@ def rasterize_cuda(
         eps2d=options.eps2d,
         sh_degree=round(sh.shape[1] ** 0.5) - 1,
         packed=False,
+        absgrad=absolute_gradients,
         backgrounds=background[None],
     )
     info.radii = meta["radii"][0].amax(dim=-1).to(means.dtype)
-    if meta["means2d"].requires_grad:
-        meta["means2d"].register_hook(lambda grad: setattr(info, "means2d_grads", grad[0]))
+    means2d = meta["means2d"]
+    if means2d.requires_grad:  # gsplat has set `absgrad` when the gradient arrives
+
+        def keep(grad: Tensor) -> None:
+            info.means2d_grads = (means2d.absgrad if absolute_gradients else grad)[0]
+
+        means2d.register_hook(keep)
     return rgb[0], alpha[0, ..., 0]

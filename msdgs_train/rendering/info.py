@@ -9,4 +9,5 @@ class RasterizationInfo:
     radii: Tensor
     """[N] larger half-extent of the footprint in pixels; 0 for Gaussians that are not drawn."""
     means2d_grads: Tensor | None = None
-    """[N, 2] d loss / d projected mean, per pixel; None before the backward pass."""
+    """[N, 2] d loss / d projected mean, per pixel, or if asked for the sums over pixels of absolute values; None before
+    the backward pass."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from msdgs_serve.rasterizer.compositing import Frame, composite
-from msdgs_serve.rasterizer.compositing_backward import composite_backward
+from msdgs_serve.rasterizer.compositing_backward import ABSOLUTE, composite_backward
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.projection_backward import project_backward
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
@@ -42,6 +42,8 @@ def rasterize(
     camera: Camera,
     background: Tensor,
     options: RasterizerOptions = GSPLAT,
+    *,
+    absolute_gradients: bool = False,
 ) -> tuple[Tensor, Tensor, RasterizationInfo]:
     """Draw N activated Gaussians; differentiable in every tensor.
 
@@ -63,13 +65,13 @@ def rasterize(
     if means.is_cuda:
         from msdgs_train.rendering.cuda import rasterize_cuda
 
-        rgb, alpha = rasterize_cuda(gaussians, camera, background, options, info)
+        rgb, alpha = rasterize_cuda(gaussians, camera, background, options, info, absolute_gradients)
     else:
-        rgb, alpha = _Rasterize.apply(camera, options, info, background, *gaussians)
+        rgb, alpha = _Rasterize.apply(camera, options, info, absolute_gradients, background, *gaussians)
     return rgb, alpha, info
 
 
-BACKGROUND = 3
+BACKGROUND = 4
 """Index of `background` among the arguments. Its gradient is only computed on demand: for a large image it takes half
 as long as all others."""
 
@@ -81,6 +83,7 @@ class _Rasterize(torch.autograd.Function):
         camera: Camera,
         options: RasterizerOptions,
         info: RasterizationInfo,
+        absolute_gradients: bool,
         background: Tensor,
         *gaussians: Tensor,
     ) -> tuple[Tensor, Tensor]:
@@ -93,7 +96,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.save_for_backward(*gaussians, image)
         ctx.drawn = (splats, tiles, frame.alpha)
         ctx.view = (camera, options)
-        ctx.info = info
+        ctx.info, ctx.absolute = info, absolute_gradients
         return image, torch.from_numpy(frame.alpha)
 
     @staticmethod
@@ -102,11 +105,11 @@ class _Rasterize(torch.autograd.Function):
         splats, tiles, alpha = ctx.drawn
         grad_rgb, grad_alpha = (np.ascontiguousarray(grad.numpy()) for grad in grad_outputs)
         frame = Frame(rgb, alpha, depth=np.empty((0, 0), rgb.dtype))
-        sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha)
+        sums = composite_backward(splats, tiles, ctx.view[1], frame, grad_rgb, grad_alpha, absolute=ctx.absolute)
         grads = project_backward(Gaussians(*arrays), splats, sums, *ctx.view)
-        ctx.info.means2d_grads = torch.from_numpy(grads.means2d)
+        ctx.info.means2d_grads = torch.from_numpy(sums[:, ABSOLUTE] if ctx.absolute else grads.means2d)
         arrays = (grads.means, grads.quats, grads.scales, grads.opacities, grads.sh)
         grad_background = None
         if ctx.needs_input_grad[BACKGROUND]:
             grad_background = torch.from_numpy(np.einsum("hw,hwc->c", 1 - alpha, grad_rgb))
-        return None, None, None, grad_background, *(torch.from_numpy(array) for array in arrays)
+        return None, None, None, None, grad_background, *(torch.from_numpy(array) for array in arrays)

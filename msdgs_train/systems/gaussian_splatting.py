@@ -101,7 +101,9 @@ class GaussianSplatting:
         motions, c = self._motions(frame.t, step), self.config.loss
         posed = self._pose(self.model, frame.t, step, motions)
         seen = self.poses.seen(posed, frame.camera) if self.poses and step >= self.schedule.static_steps else posed
-        rgb, alpha, info = rasterize(*seen, frame.camera, background, self._options(step + 1))
+        absolute = self.config.density.absolute_gradients
+        options = self._options(step + 1)
+        rgb, alpha, info = rasterize(*seen, frame.camera, background, options, absolute_gradients=absolute)
         loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction, target.mask)
         loss = loss + self._regularizers(posed, motions, frame.t, step)
         if c.alpha_weight:

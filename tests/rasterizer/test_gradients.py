@@ -206,6 +206,31 @@ def test_gradients_of_projected_means_and_radii():
     np.testing.assert_array_equal(info.means2d_grads.numpy()[info.radii.numpy() == 0], 0)
 
 
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_absolute_gradients_of_projected_means_behind_one_another(options: RasterizerOptions):
+    """Against autograd in a mean of each pixel's own; other gradients keep their bits."""
+    gaussians, camera = random_scene(56, 40, 37, 21)
+    parameters, loss = parameters_of(as_dtype(gaussians, np.float64)), weighted(np.ones((21, 37)))
+    args = (parameters.means, parameters.quats, parameters.scales, parameters.opacities, parameters.sh)
+    drawn = [
+        rasterize(*args, camera, parameters.background, options, absolute_gradients=absolute)
+        for absolute in (True, False)
+    ]
+    grads = [gradients((rgb, alpha), loss, parameters) for rgb, alpha, _ in drawn]
+    assert all(np.array_equal(grads[0][kind], grads[1][kind]) for kind in KINDS)
+    splats = reference_torch.project(*args[:3], parameters.sh, camera, options)
+    means2d = splats.means2d.detach()[..., None, None].repeat(1, 1, 21, 37).requires_grad_()
+    plain = reference_torch.render(
+        splats._replace(means2d=means2d), parameters.opacities, camera, parameters.background, options
+    )
+    of_pixels = torch.autograd.grad(loss(*plain), means2d)[0].numpy()
+    for (_, _, info), want in zip(drawn, (np.abs(of_pixels), of_pixels), strict=True):
+        assert info.means2d_grads is not None
+        want = want.sum(axis=(2, 3))
+        assert_close(info.means2d_grads.numpy() / np.abs(want).max(), want / np.abs(want).max(), "gradient.autograd")
+        np.testing.assert_array_equal(info.means2d_grads.numpy()[info.radii.numpy() == 0], 0)
+
+
 def test_radii_are_zero_where_nothing_is_drawn_and_bound_what_is():
     gaussians = gaussians_of(
         [[0, 0, 2], [0, 0, -2], [50, 0, 2], [0, 0, 2]], scales=0.1, opacities=[0.9, 0.9, 0.9, 0.001]

@@ -1,18 +1,21 @@
 """Density control: cloning, splitting and pruning, and Adam's moments of the Gaussians."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from msdgs_train.datasets import load_scene
 from msdgs_train.density.config import DensityConfig
 from msdgs_train.density.gradient import MIN_PATIENCE, SPLIT_SHRINK, GradientStrategy
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.rendering.info import RasterizationInfo
-from tests.support.training_scene import moment_rows, small_config, with_moments
+from tests.support.tolerances import tolerance
+from tests.support.training_scene import moment_rows, small_config, splatting, trained, with_moments
 
 EXTENT = 4.0
 
@@ -52,6 +55,21 @@ def test_gradients_are_scaled_to_ndc_and_averaged_over_where_drawn() -> None:
     control.accumulate(_screen(grads, [1.0, 0.0]), 20, 20, False)
     assert torch.allclose(control.gradients, torch.tensor([10.0, 0.0]))
     assert control.counts.tolist() == [2.0, 0.0]
+
+
+def test_absolute_gradients_are_accumulated_if_asked_for(data: Path) -> None:
+    """And the step is the same."""
+    signed, absolute = (
+        trained(small_config(absolute_gradients=wanted), load_scene(data), 1) for wanted in (False, True)
+    )
+    control = [splatting(trainer).density for trainer in (signed, absolute)]
+    assert all(isinstance(each, GradientStrategy) for each in control)
+    (small, counts, _), (large, same_counts, _) = (each.state() for each in control)
+    assert torch.equal(counts, same_counts)
+    assert bool((large >= small * (1 - tolerance("float32.relative"))).all())
+    assert float(large.sum()) > 1.2 * float(small.sum())
+    for one, other in zip(signed.system.model.parameters(), absolute.system.model.parameters(), strict=True):
+        assert torch.equal(one, other)
 
 
 def test_small_ones_are_cloned_as_they_are() -> None:
