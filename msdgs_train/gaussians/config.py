@@ -79,13 +79,15 @@ class ModelConfig:
                 raise InvalidInput(f"model.layers.{index}", f"one of {', '.join(LAYERS)}", layer)
             _check_rates(f"model.layers.{index}", layer)
             layer.check(f"model.layers.{index}", self.support.moves_nodes)
+            if self.support.extra_heads and not layer.has_extra_heads:
+                heads = f"{', '.join(self.support.extra_heads)} for --support {self.support.kind}"
+                raise InvalidInput(f"model.layers.{index}", f"of a kind that predicts {heads}", layer.kind)
         if self.scale_space not in get_args(ScaleSpace):
             raise InvalidInput("model.scale_space", f"one of {list(get_args(ScaleSpace))}", self.scale_space)
+        if self.layers and self.scale_space not in self.support.scale_spaces:
+            allowed = f"{' or '.join(self.support.scale_spaces)} with --support {self.support.kind}"
+            raise InvalidInput("model.scale_space", allowed, self.scale_space)
         if self.layers and self.support.moves_nodes:
-            if self.scale_space != "log":
-                raise InvalidInput(
-                    "model.scale_space", "log with nodes, whose scale deltas are factors", self.scale_space
-                )
             for name in ("opacity_head", "sh_head"):
                 if getattr(self, name):
                     raise InvalidInput(f"model.{name}", "off with nodes, which move Gaussians only", True)
@@ -93,7 +95,8 @@ class ModelConfig:
     @property
     def heads(self) -> Heads:
         """Outputs of each layer besides deltas of means, scales and quaternions."""
-        return Heads(self.weights, self.opacity_head, sh_coefficients(self.sh_degree) if self.sh_head else 0)
+        sh = sh_coefficients(self.sh_degree) if self.sh_head else 0
+        return Heads(self.weights, self.opacity_head, sh, tuple(self.support.extra_heads.items()))
 
     @property
     def modulation_lr(self) -> LearningRate:

@@ -90,13 +90,14 @@ class DynamicGaussians(nn.Module):
         )
 
     def motion_groups(self) -> list[ParamGroup]:
-        """The parameter groups of layers, of modulation, and of attributes of modulation and support."""
+        """The parameter groups of layers, support and modulation, and of attributes of modulation and support."""
         groups = [
             group._replace(name=f"layers.{index}.{group.name}")
             for index, layer in enumerate(self.deformation)
             for group in layer.parameter_groups()
             if group.params
         ]
+        groups += [group._replace(name=f"support.{group.name}") for group in self.support.parameter_groups()]
         if self.modulation is not None:
             params = list(self.modulation.parameters())
             groups.append(ParamGroup("modulation", params, self.config.modulation_lr))

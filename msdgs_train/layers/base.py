@@ -6,7 +6,9 @@ A new kind is one file: a frozen dataclass that derives from `LayerConfig`, a mo
 """
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
 from torch import Tensor, nn
@@ -17,6 +19,8 @@ from msdgs_train.layers.parameters import ParamGroup
 HEAD_COLUMNS = {"means": slice(0, 3), "scales": slice(3, 6), "quats": slice(6, 10)}
 """Columns of a layer's deltas, in the order of `Heads.sizes`; the logit of the step weight, if any, is the last."""
 
+NO_EXTRA: Mapping[str, Tensor] = MappingProxyType({})
+
 
 class Heads(NamedTuple):
     """Outputs of a layer besides deltas of means, scales and quaternions."""
@@ -24,17 +28,21 @@ class Heads(NamedTuple):
     weight: bool = True  # False: all step weights are 1
     opacity: bool = False
     sh: int = 0  # coefficients (degree + 1)² per channel; 0: none
+    extra: tuple[tuple[str, int], ...] = ()  # names and columns, as `SupportConfig.extra_heads`
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Columns of means, scales, quats, opacity, SH, and the logit of the weight; 0 for an absent output."""
-        return (3, 3, 4, int(self.opacity), 3 * self.sh, int(self.weight))
+        """Columns of means, scales, quats, opacity, SH, extra heads, and the logit of the weight; 0 for an absent
+        output."""
+        extra = (columns for _, columns in self.extra)
+        return (3, 3, 4, int(self.opacity), 3 * self.sh, *extra, int(self.weight))
 
     @property
     def columns(self) -> dict[str, slice]:
         """Columns of the deltas of each head that is there, by name."""
         ends = list(itertools.accumulate(self.sizes, initial=0))
-        spans = zip((*HEAD_COLUMNS, "opacities", "sh"), ends, ends[1:], strict=False)
+        names = (*HEAD_COLUMNS, "opacities", "sh", *(name for name, _ in self.extra))
+        spans = zip(names, ends, ends[1:], strict=False)
         return {name: slice(start, stop) for name, start, stop in spans if stop > start}
 
 
@@ -57,14 +65,17 @@ class LayerStep(NamedTuple):
     weight: Tensor  # [N, 1] in (0, 1); 1 without the head
     delta_opacities: Tensor | None = None  # [N] of logits
     delta_sh: Tensor | None = None  # [N, (degree + 1)², 3]
+    extra: Mapping[str, Tensor] = NO_EXTRA  # [N, ·] outputs of extra heads, by name
 
     @classmethod
     def of_columns(cls, columns: Tensor, heads: Heads) -> "LayerStep":
         """Split the concatenated outputs of all heads, [N, sum of `heads.sizes`]."""
-        means, scales, quats, opacity, sh, logit = columns.split(heads.sizes, dim=1)
+        means, scales, quats, opacity, sh, *values, logit = columns.split(heads.sizes, dim=1)
         weight = logit.sigmoid() if heads.weight else columns.new_ones(len(columns), 1)
         opacities = opacity[:, 0] if heads.opacity else None
-        return cls(means, scales, quats, weight, opacities, sh.unflatten(1, (heads.sh, 3)) if heads.sh else None)
+        coefficients = sh.unflatten(1, (heads.sh, 3)) if heads.sh else None
+        extra = {name: value for (name, _), value in zip(heads.extra, values, strict=True)}
+        return cls(means, scales, quats, weight, opacities, coefficients, extra)
 
 
 class DeformationLayer(nn.Module):
@@ -100,6 +111,8 @@ class LayerConfig:
 
     kind: ClassVar[str]
     """The name of this kind of layer in configurations and files."""
+    has_extra_heads: ClassVar[bool] = True
+    """Whether a layer predicts the heads that a support asks for (`SupportConfig.extra_heads`)."""
 
     def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> DeformationLayer:
         """A new layer, with zero deltas; `num_points` is the number of control nodes, None if it moves Gaussians."""

@@ -1,13 +1,13 @@
 """The multi-step deformation: layers in a chain, each with a learned weight (paper, section 3.2)."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from msdgs_train.layers.base import DeformationLayer
+from msdgs_train.layers.base import NO_EXTRA, DeformationLayer
 
 
 class Deltas(NamedTuple):
@@ -18,6 +18,14 @@ class Deltas(NamedTuple):
     quats: Tensor  # [N, 4] wxyz, added to a unit quaternion
     opacities: Tensor | None = None  # [N] of logits; None without that head
     sh: Tensor | None = None  # [N, (degree + 1)², 3]; None without that head
+    extra: Mapping[str, Tensor] = NO_EXTRA  # [N, ·] sums of the support's extra heads, by name
+
+    @classmethod
+    def joined(cls, parts: Sequence["Deltas"]) -> "Deltas":
+        """The rows of one or more deltas of the same heads, one after the other."""
+        *columns, extra = zip(*parts, strict=True)
+        own = [None if rows[0] is None else torch.cat(rows) for rows in columns]
+        return cls(*own, {name: torch.cat([each[name] for each in extra]) for name in extra[0]})  # pyright: ignore
 
 
 class MultiStepDeformation(nn.Module):
@@ -44,6 +52,7 @@ class MultiStepDeformation(nn.Module):
                 torch.addcmul(deltas.quats, step.weight, step.delta_quats),
                 _sum(deltas.opacities, step.weight[:, 0], step.delta_opacities),
                 _sum(deltas.sh, step.weight[:, :, None], step.delta_sh),
+                {name: step.weight * value + deltas.extra.get(name, 0.0) for name, value in step.extra.items()},
             )
         return deltas
 

@@ -27,6 +27,7 @@ class SplineConfig(LayerConfig):
     """Sizes and learning rates of a spline layer."""
 
     kind: ClassVar[str] = "spline"
+    has_extra_heads: ClassVar[bool] = False
     num_knots: int = 0
     """Intervals of a spline over the time range of the scene; 0: 36, or with fixed cameras one per captured time, if
     that is more, up to 120."""

@@ -1,14 +1,18 @@
 """The interface of a support: which points a chain of layers moves, and how the Gaussians follow these points."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 from torch import Tensor, nn
 
 from msdgs_train.gaussians.attribute import Attribute
 from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
+from msdgs_train.layers.parameters import ParamGroup
 
 
 class CanonicalPoints(NamedTuple):
@@ -25,7 +29,11 @@ class SupportConfig:
 
     kind: ClassVar[str]
     moves_nodes: ClassVar[bool] = False
-    """Whether layers move control nodes, whose scale deltas are stretch tensors, instead of Gaussians."""
+    """Whether layers move control nodes instead of Gaussians."""
+    scale_spaces: ClassVar[tuple[ScaleSpace, ...]] = ("log", "linear")
+    """The spaces in which its deltas of scales can be."""
+    extra_heads: ClassVar[Mapping[str, int]] = MappingProxyType({})
+    """Outputs that each layer predicts besides those of Gaussians: columns by name."""
 
     def build(self) -> "Support":
         """A new support."""
@@ -68,6 +76,10 @@ class Support(nn.Module):
     def points(self, means: Tensor) -> Tensor:
         """[M, 3] canonical positions of the points that the chain moves, given canonical means, [N, 3]."""
         raise NotImplementedError
+
+    def parameter_groups(self) -> list[ParamGroup]:
+        """All trainable parameters of its own, each in one group, with their learning rates."""
+        return []
 
     def on_deform_start(self, gaussians: CanonicalGaussians, surgery: RowSurgery) -> None:
         """Called before the first step with deformation."""

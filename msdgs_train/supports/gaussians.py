@@ -39,9 +39,7 @@ class GaussiansSupport(Support):
         means = self.points(means)
         if torch.is_grad_enabled() or len(means) <= CHUNK:
             return chain(means, t, num_layers)
-        parts = [chain(chunk, t, num_layers) for chunk in means.split(CHUNK)]
-        columns = [[column for column in columns if column is not None] for columns in zip(*parts, strict=True)]
-        return Deltas(*(torch.cat(column) if column else None for column in columns))  # pyright: ignore
+        return Deltas.joined([chain(chunk, t, num_layers) for chunk in means.split(CHUNK)])
 
     def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
         return motions

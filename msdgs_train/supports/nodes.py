@@ -15,6 +15,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.gaussians.attribute import Attribute
 from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import check_size
@@ -43,6 +44,7 @@ class NodesConfig(SupportConfig):
 
     kind: ClassVar[str] = "nodes"
     moves_nodes: ClassVar[bool] = True
+    scale_spaces: ClassVar[tuple[ScaleSpace, ...]] = ("log",)  # deltas of scales are stretch tensors
     num_nodes: int = 256
     """Control nodes."""
     k_nearest: int = MAX_NEAREST
@@ -98,7 +100,8 @@ class NodesSupport(Support):
     def follow(self, gaussians: CanonicalPoints, motions: Tensor) -> Deltas:
         weights = skinning_weights(gaussians.attributes["skinning_logits"])
         columns = skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions)
-        return Deltas(*columns.split((3, 3, 4), dim=1))
+        means, scales, quats = columns.split((3, 3, 4), dim=1)
+        return Deltas(means, scales, quats)
 
     def points(self, means: Tensor) -> Tensor:
         return self.nodes

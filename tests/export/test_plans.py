@@ -219,7 +219,8 @@ class Rigid(Support):
 
     def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
         parts = motions.means, motions.scales, motions.quats
-        return Deltas(*(part.expand(len(gaussians.means), -1) for part in parts))
+        means, scales, quats = (part.expand(len(gaussians.means), -1) for part in parts)
+        return Deltas(means, scales, quats)
 
     def points(self, means: torch.Tensor) -> torch.Tensor:
         return means.new_zeros(1, 3)
