@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_, get_total_norm
@@ -22,7 +23,7 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.evaluation.metrics import ImageMetrics, image_metrics, psnr_from_mse
 from msdgs_train.gaussians import safe_load
 from msdgs_train.layers.parameters import ParamGroup
-from msdgs_train.systems.base import System, Target
+from msdgs_train.systems.base import Moment, System, Target
 from msdgs_train.systems.registry import system_of
 
 FORMAT = "msdgs-checkpoint/3"
@@ -194,7 +195,7 @@ class Trainer:
         size = self.config.run.batch_size
         first = self.optimizer_steps * size
         drawn = [
-            (self._curriculum.next(number, self.step_count, self._generator), self._next_background())
+            (self._curriculum.next(number, self.step_count, self._generator), self._next_background(), number)
             for number in range(first, first + size)
         ]
         if size == 1:
@@ -207,14 +208,21 @@ class Trainer:
         return ThreadPoolExecutor(self.config.run.threads, "image", torch.set_num_threads, (1,))
 
     @sharing_cores()
-    def _differentiate(self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor) -> ViewGradients:
+    def _differentiate(
+        self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor, number: int
+    ) -> ViewGradients:
+        """Of the image of this number since the start of the run."""
         if self.schedule.halves(frame.camera.width, self.step_count):
             rgba, mask, frame = self._images.half_rgba(frame), self._images.half_mask(frame), frame.halved()
         else:
             rgba, mask = self._images.rgba(frame), self._images.mask(frame)
         target = Target.over(rgba, background, self.config.run.device, mask)
-        view = self.system.loss(frame, target, background.to(target.rgb.device), self.step_count)
+        view = self.system.loss(frame, target, background.to(target.rgb.device), self._moment(number))
         return differentiate(groups, frame, view, target)
+
+    def _moment(self, number: int) -> Moment:
+        seeds = np.random.SeedSequence([self.config.run.seed, self.rollbacks, number])
+        return Moment(self.step_count, torch.Generator().manual_seed(int(seeds.generate_state(1)[0])))
 
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":

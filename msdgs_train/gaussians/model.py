@@ -56,17 +56,18 @@ class DynamicGaussians(nn.Module):
         sh_degree: int | None = None,
         ids: Tensor | None = None,
         motions: Any = None,
+        points: CanonicalPoints | None = None,
     ) -> PosedGaussians:
         """The Gaussians at time `t`.
 
         `num_layers` stops after that many layers, `deform=False` gives the canonical Gaussians without running any,
-        `sh_degree` omits the SH bands above it, `ids`, int64 [M], poses only these Gaussians, and `motions` are those
-        of the support at `t`, if they are known.
+        `sh_degree` omits the SH bands above it, `ids`, int64 [M], poses only these Gaussians; `motions` of the support
+        at `t` and `points`, what it reads of the Gaussians, are given if they are known.
         """
         g = self.gaussians.rows(ids)
         rest = sh_coefficients(self.config.sh_degree if sh_degree is None else sh_degree) - 1
         sh = torch.cat([g.sh_dc, g.sh_rest if rest == g.sh_rest.shape[1] else g.sh_rest[:, :rest]], dim=1)
-        points, raw_opacities = canonical_points(g), g.raw_opacities
+        points, raw_opacities = points or canonical_points(g), g.raw_opacities
         means, quats, _ = points
         if not (deform and len(self.deformation) and num_layers != 0):
             return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)

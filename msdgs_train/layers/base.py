@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import InvalidInput
@@ -92,8 +93,9 @@ class DeformationLayer(nn.Module):
         """All trainable parameters, each in one group, with their learning rates."""
         raise NotImplementedError
 
-    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
-        """Weighted terms of the loss at time `t`, by name."""
+    def regularizers(self, points: Tensor, t: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
+        """Weighted terms of the loss at time `t`, by name; `points`, [N, 3], are the canonical positions of what the
+        chain moves, and all randomness is the generator's, which is on the CPU."""
         return {}
 
     def on_window(self, before: float, after: float) -> None:

@@ -200,7 +200,7 @@ class PlaneLayer(DeformationLayer):
             ParamGroup("networks", networks, LearningRate(c.lr_init, c.lr_final, holds=True), True),
         ]
 
-    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
+    def regularizers(self, points: Tensor, t: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         c, terms = self.config, {}
         for i, grid in enumerate(self.plane_grids()):
             for weight, name, term in (

@@ -99,7 +99,7 @@ class SplineLayer(DeformationLayer):
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
         return [ParamGroup("curves", list(self.parameters()), lr)]
 
-    def regularizers(self, t: Tensor) -> dict[str, Tensor]:
+    def regularizers(self, points: Tensor, t: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         return {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}
 
     def temporal_smoothness(self, t: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 from msdgs_train.gaussians.attribute import Attribute
@@ -84,8 +85,11 @@ class Support(nn.Module):
     def on_deform_start(self, gaussians: CanonicalGaussians, surgery: RowSurgery) -> None:
         """Called before the first step with deformation."""
 
-    def regularizers(self, motions: Any) -> dict[str, Tensor]:
-        """Weighted terms of the loss at the time of the motions, by name."""
+    def regularizers(
+        self, motions: Any, gaussians: CanonicalPoints, t: Tensor, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """Weighted terms of the loss, by name, given the motions at time `t`; all randomness is the generator's, which
+        is on the CPU."""
         return {}
 
     def baked(self, attributes: dict[str, Tensor]) -> dict[str, Any]:

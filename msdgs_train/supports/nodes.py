@@ -148,7 +148,9 @@ class NodesSupport(Support):
         nearest = logits.topk(self.config.followed, dim=1)
         return (nearest.values - nearest.values[:, :1]).clamp_min(MIN_INITIAL_LOGIT), nearest.indices
 
-    def regularizers(self, motions: Tensor) -> dict[str, Tensor]:
+    def regularizers(
+        self, motions: Tensor, gaussians: CanonicalPoints, t: Tensor, generator: torch.Generator
+    ) -> dict[str, Tensor]:
         return {"arap": self.config.arap_weight * self.local_rigidity(motions)}
 
     def local_rigidity(self, motions: Tensor) -> Tensor:

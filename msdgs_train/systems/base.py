@@ -49,6 +49,13 @@ class Target(NamedTuple):
         return float(error.mean() if self.mask is None else error[self.mask].mean().nan_to_num())
 
 
+class Moment(NamedTuple):
+    """A step of the schedule, and the random numbers of one of its images."""
+
+    step: int  # counted from 0
+    generator: torch.Generator  # of this image alone, so that any number of threads and resumed runs draw the same
+
+
 class ViewLoss(NamedTuple):
     """One rendered training image and its loss."""
 
@@ -81,9 +88,9 @@ class System(Protocol):
         one: one, unless the schedule follows the clock."""
         ...
 
-    def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
-        """Render a frame over `background`, [3], and compare it with its image; `step` is counted from 0. Called from
-        several threads at once."""
+    def loss(self, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
+        """Render a frame over `background`, [3], and compare it with its image. Called from several threads at
+        once."""
         ...
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:

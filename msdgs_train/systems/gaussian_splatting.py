@@ -20,7 +20,7 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
 from msdgs_train.gaussians.bounds import first_by_pose, scene_bounds, scene_scale, spread_frames, views_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
-from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians, canonical_points
 from msdgs_train.gaussians.scale_space import count_clamped
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import SceneBounds
@@ -28,7 +28,8 @@ from msdgs_train.layers.parameters import LearningRate, ParamGroup, constant
 from msdgs_train.losses.photometric import photometric_loss
 from msdgs_train.poses.refinement import PoseRefinement
 from msdgs_train.rendering.rasterize import rasterize
-from msdgs_train.systems.base import Target, ViewLoss
+from msdgs_train.supports.base import CanonicalPoints
+from msdgs_train.systems.base import Moment, Target, ViewLoss
 
 VIEWER_CAMERAS, TRAINING_CAMERAS = 20, 32
 """Cameras that a model file keeps: of the test split, or of training if there is none, and others of training."""
@@ -97,15 +98,17 @@ class GaussianSplatting:
             for layer in self.model.deformation:
                 layer.on_window(before, after)
 
-    def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
-        motions, c = self._motions(frame.t, step), self.config.loss
-        posed = self._pose(self.model, frame.t, step, motions)
+    def loss(self, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
+        step, c = moment.step, self.config.loss
+        points = canonical_points(self.model.gaussians.rows())
+        motions = self._motions(points, frame.t, step)
+        posed = self._pose(self.model, frame.t, step, motions, points)
         seen = self.poses.seen(posed, frame.camera) if self.poses and step >= self.schedule.static_steps else posed
         absolute = self.config.density.absolute_gradients
         options = self._options(step + 1)
         rgb, alpha, info = rasterize(*seen, frame.camera, background, options, absolute_gradients=absolute)
         loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction, target.mask)
-        loss = loss + self._regularizers(posed, motions, frame.t, step)
+        loss = loss + self._regularizers(posed, motions, points, frame.t, moment)
         if c.alpha_weight:
             loss = loss + c.alpha_weight * target.alpha_error(alpha)
         clamped = count_clamped(self.config.model.scale_space, posed.scales)
@@ -176,26 +179,35 @@ class GaussianSplatting:
         """Options of the rasterizer in a step, counted from 1."""
         return GSPLAT._replace(eps2d=self.schedule.eps2d(step))
 
-    def _pose(self, model: DynamicGaussians, t: float, step: int, motions: Any = None) -> PosedGaussians:
+    def _pose(
+        self,
+        model: DynamicGaussians,
+        t: float,
+        step: int,
+        motions: Any = None,
+        points: CanonicalPoints | None = None,
+    ) -> PosedGaussians:
         degree, deform = self.schedule.sh_degree(step), self.schedule.deforms(step)
-        return model.pose(t, deform=deform, sh_degree=degree, motions=motions)
+        return model.pose(t, deform=deform, sh_degree=degree, motions=motions, points=points)
 
-    def _motions(self, t: float, step: int) -> Any:
+    def _motions(self, points: CanonicalPoints, t: float, step: int) -> Any:
         """Those of the support, once for the pose and the regularizers."""
         if not (self.schedule.deforms(step) and len(self.model.deformation)):
             return None
-        means = self.model.gaussians.means
-        return self.model.support.motions(self.model.deformation, means, means.new_tensor(t))
+        return self.model.support.motions(self.model.deformation, points.means, points.means.new_tensor(t))
 
-    def _regularizers(self, posed: PosedGaussians, motions: Any, t: float, step: int) -> Tensor | float:
+    def _regularizers(
+        self, posed: PosedGaussians, motions: Any, points: CanonicalPoints, t: float, moment: Moment
+    ) -> Tensor | float:
         """The weighted sum of the regularizers of density control, support and layers."""
-        pruning = self.schedule.prunes_hidden(step, several_per_time=self.several_per_time)
+        pruning = self.schedule.prunes_hidden(moment.step, several_per_time=self.several_per_time)
         terms = list(self.config.density.regularizers(posed.opacities, posed.scales, pruning=pruning).values())
         if motions is not None:
-            time = posed.means.new_tensor(t)
-            terms += self.model.support.regularizers(motions).values()
+            support, time = self.model.support, posed.means.new_tensor(t)
+            terms += support.regularizers(motions, points, time, moment.generator).values()
+            moved = support.points(points.means)
             for layer in self.model.deformation:
-                terms += layer.regularizers(time).values()
+                terms += layer.regularizers(moved, time, moment.generator).values()
         return sum(terms, 0.0)
 
 

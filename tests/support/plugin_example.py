@@ -23,7 +23,7 @@ from msdgs_train.layers.base import (
 )
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.registry import register_layer
-from msdgs_train.systems.base import Target, ViewLoss
+from msdgs_train.systems.base import Moment, Target, ViewLoss
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from msdgs_train.systems.registry import register_system
 
@@ -91,9 +91,9 @@ MOTION_WEIGHT = 0.01
 class SparseMotion(GaussianSplatting):
     """Gaussian splatting that prefers to leave Gaussians where they are."""
 
-    def loss(self, frame: Frame, target: Target, background: Tensor, step: int) -> ViewLoss:
-        view = super().loss(frame, target, background, step)
-        if not self.schedule.deforms(step):
+    def loss(self, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
+        view = super().loss(frame, target, background, moment)
+        if not self.schedule.deforms(moment.step):
             return view
         displacement = self.model.pose(frame.t).means - self.model.gaussians.means
         return view._replace(loss=view.loss + MOTION_WEIGHT * displacement.abs().mean())

@@ -9,12 +9,13 @@ import torch
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.rendering.rasterize import rasterize
-from msdgs_train.systems.base import Target
+from msdgs_train.systems.base import Moment, Target
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import small_config
 
 WEIGHT = 3.0
+MOMENT = Moment(0, torch.Generator())
 
 
 def test_alpha_is_compared_with_that_of_the_image(data: Path) -> None:
@@ -26,7 +27,7 @@ def test_alpha_is_compared_with_that_of_the_image(data: Path) -> None:
     with_weight, without = (
         GaussianSplatting(Schedule.from_config(small_config(alpha_weight=weight)), scene) for weight in (WEIGHT, 0.0)
     )
-    losses = [system.loss(frame, target, white, 0).loss.item() for system in (with_weight, without)]
+    losses = [system.loss(frame, target, white, MOMENT).loss.item() for system in (with_weight, without)]
     posed = without.model.pose(frame.t, deform=False, sh_degree=0)
     alpha = rasterize(*posed, frame.camera, white)[1].detach().double().numpy()
     expected = WEIGHT * np.abs(rgba[:, :, 3] / 255 - alpha).mean()
@@ -63,7 +64,7 @@ def test_with_an_opacity_head_an_image_never_shows_everything(data: Path) -> Non
     rgba[1:-1, 1:-1, 3] = 255
     shown = [
         GaussianSplatting(Schedule.from_config(small_config(opacity_head=head)), scene)
-        .loss(frame, Target.over(rgba, white), white, 0)
+        .loss(frame, Target.over(rgba, white), white, MOMENT)
         .shows_all
         for head in (False, True)
     ]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
-from msdgs_train.datasets import load_scene
+from msdgs_train.datasets import Frame, load_scene
 from msdgs_train.density import config as density_module
 from msdgs_train.density.gradient import GradientStrategy
 from msdgs_train.engine import schedule as schedule_module
@@ -30,7 +30,8 @@ from msdgs_train.layers.parameters import exponential
 from msdgs_train.layers.plane import PlaneConfig, PlaneLayer
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems import gaussian_splatting as system_module
-from msdgs_train.systems.base import Target
+from msdgs_train.systems.base import Moment, Target, ViewLoss
+from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import (
     MLP,
@@ -124,6 +125,33 @@ def test_resuming_changes_no_bit(
         assert_same_bits(whole, state_of(parts))
         lines = [[{**line, "seconds": 0} for line in read_metrics(run)] for run in (tmp_path / "whole", parts)]
         assert lines[0] == lines[1]
+
+
+def test_each_image_has_random_numbers_of_its_own(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither threads nor a resumed run change them."""
+    drawn: dict[int, set[float]] = {}
+    original = GaussianSplatting.loss
+
+    def loss(system: GaussianSplatting, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
+        drawn.setdefault(moment.step, set()).add(float(torch.rand((), generator=moment.generator)))
+        return original(system, frame, target, background, moment)
+
+    monkeypatch.setattr(GaussianSplatting, "loss", loss)
+    found = []
+    for threads in (1, 2):
+        trained(small_config(batch_size=2, threads=threads), load_scene(data), 4)
+        found.append(drawn.copy())
+        drawn.clear()
+    trainer = trained(small_config(batch_size=2), load_scene(data), 2)
+    trainer.save_checkpoint(tmp_path / "checkpoint.pt", 0.0)
+    resumed = Trainer(trainer.config, trainer.scene)
+    resumed.load_checkpoint(tmp_path / "checkpoint.pt")
+    resumed.step()
+    resumed.step()
+    assert found[0] == found[1] == drawn
+    assert len(set().union(*drawn.values())) == 2 * 4
 
 
 def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
@@ -270,7 +298,7 @@ def test_weighted_regularizers_are_added_to_the_loss(
         frame = load_scene(data).splits["train"][0]
         target, black = Target(torch.zeros(SIZE, SIZE, 3), torch.zeros(SIZE, SIZE)), torch.zeros(3)
         monkeypatch.setattr(system_module, "photometric_loss", lambda *arguments: torch.zeros(()))
-        loss = system.loss(dataclasses.replace(frame, t=0.3), target, black, step).loss
+        loss = system.loss(dataclasses.replace(frame, t=0.3), target, black, Moment(step, torch.Generator())).loss
         assert float(loss) == pytest.approx(float(expected), rel=tolerance("float32.relative"))
 
 

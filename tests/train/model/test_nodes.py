@@ -12,6 +12,7 @@ from msdgs_train.layers.base import LayerConfig
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.quaternions import multiply, rotation_matrices
 from msdgs_train.layers.spline import SplineConfig, SplineLayer
+from msdgs_train.supports.base import CanonicalPoints
 from msdgs_train.supports.nodes import NodesConfig, NodesSupport
 from msdgs_train.supports.skinning import skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MIN_STRETCH
@@ -177,7 +178,8 @@ def test_a_body_that_moves_as_one_is_rigid() -> None:
         expected = torch.where(touched, 0.5 / (distances.gather(1, near) + 0.01), 0.0).mean()
         motions = support.motions(chain, means, time(0.4))
         assert float(support.local_rigidity(motions)) == pytest.approx(float(expected))
-        weighted = support.regularizers(motions)
+        gaussians = CanonicalPoints(means, torch.zeros(6, 4), {})
+        weighted = support.regularizers(motions, gaussians, time(0.4), torch.Generator())
         assert {name: float(term) for name, term in weighted.items()} == {"arap": pytest.approx(0.1 * float(expected))}
 
 
@@ -214,5 +216,6 @@ def test_one_node_has_no_neighbor_to_move_with() -> None:
     model = random_model(5, support=NodesConfig(num_nodes=1))
     support = model.support
     assert isinstance(support, NodesSupport)
-    motions = support.motions(model.deformation, model.gaussians.means, torch.tensor(0.4))
-    assert {name: float(term) for name, term in support.regularizers(motions).items()} == {"arap": 0.0}
+    points, t = canonical_points(model.gaussians.rows()), torch.tensor(0.4)
+    terms = support.regularizers(support.motions(model.deformation, points.means, t), points, t, torch.Generator())
+    assert {name: float(term) for name, term in terms.items()} == {"arap": 0.0}

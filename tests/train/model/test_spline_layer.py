@@ -68,7 +68,7 @@ def test_straight_motion_is_smooth() -> None:
         layer.transls[5, 0, 1] += 0.6
         assert float(layer.temporal_smoothness(time(0.5))) == pytest.approx((0.6 + 1.2) / (2 * 2 * 3))
         assert float(layer.temporal_smoothness(time(0.1))) <= EXACT
-        weighted = layer.regularizers(time(0.5))
+        weighted = layer.regularizers(torch.zeros(2, 3), time(0.5), torch.Generator())
         assert float(weighted["motion_smoothness"]) == pytest.approx(0.2 * (0.6 + 1.2) / (2 * 2 * 3))
 
 
