@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
@@ -55,6 +56,15 @@ class Checked:
     def names(self) -> tuple[str, ...]:
         """Names of all fields."""
         return tuple(item.name for item in dataclasses.fields(self))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class SystemConfig(Checked):
+    """Settings of one system alone; a system that has some derives from it, with names that no other group has."""
+
+
+OWN_SETTINGS: dict[str, type[SystemConfig]] = {}
+"""Their types by the name of the system, of those that are registered."""
 
 
 def _is_number(value: Any) -> bool:

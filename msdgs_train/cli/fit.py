@@ -147,7 +147,8 @@ def _cli(arguments: Sequence[str], default: Fit) -> Fit:
 def _short_help(command: Fit) -> Any:
     """Return the same command, of a type that hides rarely used options in its help."""
     config = command.config
-    groups = {item.name: _hiding(getattr(config, item.name), COMMON.get(item.name, ())) for item in fields(config)}
+    common = COMMON | {"own": config.own.names()}
+    groups = {item.name: _hiding(getattr(config, item.name), common.get(item.name, ())) for item in fields(config)}
     kinds = [(name, type(group)) for name, group in groups.items()]
     settings = make_dataclass("Settings", kinds, frozen=True)(**groups)
     own = [item.name for item in fields(command) if item.name not in RARE]

@@ -13,9 +13,10 @@ from msdgs_train.density.config import DensityConfig
 from msdgs_train.engine.curriculum_config import CurriculumConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
+from msdgs_train.layers.plugins import load_plugins
 from msdgs_train.losses.config import LossConfig
 from msdgs_train.poses.config import PoseConfig
-from msdgs_train.settings import Checked, optional
+from msdgs_train.settings import OWN_SETTINGS, Checked, SystemConfig, optional
 
 SMALL_LAYER = MLPConfig(width=96, depth=2, xyz_frequencies=4, time_width=64)
 SMALL_MODEL = ModelConfig(sh_degree=2, layers=(SMALL_LAYER, SMALL_LAYER))
@@ -56,12 +57,15 @@ class RunConfig(Checked):
 
 @dataclass(frozen=True)
 class OptimizerConfig(Checked):
-    """Learning rates of the canonical Gaussians, and the average that is evaluated; layers have their own rates."""
+    """Adam, learning rates of the canonical Gaussians, and the average that is evaluated; layers have their own
+    rates."""
 
     means_lr_init: float = 8e-4
     """Learning rate of means, in scene units; Adam moves a mean by about this much a step."""
     means_lr_final: float = 8e-6
     """Learning rate of means at the last step, to which it decays exponentially."""
+    means_lr_until_fraction: float = 1.0
+    """Fraction of the run after which the rate of means has reached its last value."""
     sh_dc_lr: float = 2.5e-3
     """Learning rate of colors; constant, as those below."""
     sh_rest_lr: float = 1.25e-4
@@ -72,6 +76,13 @@ class OptimizerConfig(Checked):
     """Learning rate of logarithms of scales."""
     quats_lr: float = 1e-3
     """Learning rate of quaternions."""
+    adam_beta2: float = 0.999
+    """Decay of Adam's mean of squared gradients."""
+    adam_eps: float = 1e-15
+    """Added to the root of that mean. Adam's usual one, 1e-8, is as large as the gradients of small Gaussians."""
+    gradient_clip: Annotated[float | None, optional("FLOAT")] = 1.0
+    """Largest norm of the joint gradient of networks and grids, whose typical norms are 0.05 to 0.6; published loops
+    have no limit."""
     sh_degree_fraction: float = 0.125
     """Fraction of the run after which the degree of the spherical harmonics in use rises by one; 0: all from the
     start."""
@@ -82,8 +93,10 @@ class OptimizerConfig(Checked):
     all times take part and density control has ended, which reduces mini-batch noise; 0: the last step's."""
 
     def __post_init__(self) -> None:
-        self.require_positive(*(name for name in self.names() if "_lr" in name))
-        self.require_fractions("sh_degree_fraction", "ema_fraction")
+        self.require_positive("adam_eps", "means_lr_until_fraction", *(n for n in self.names() if "_lr" in n))
+        self.require_fractions("means_lr_until_fraction", "sh_degree_fraction", "ema_fraction")
+        self.require(("adam_beta2",), "in [0, 1)", lambda v: type(v) in (int, float) and 0 <= v < 1)
+        self.require_positive_or_none("gradient_clip")
         self.require_weights(*(["eps2d_init"] if self.eps2d_init is not None else []))
 
 
@@ -117,9 +130,10 @@ class TrainConfig:
     optimizer: OptimizerConfig = OptimizerConfig()
     logging: LoggingConfig = LoggingConfig()
     model: ModelConfig = SMALL_MODEL
+    own: SystemConfig = SystemConfig()
 
     def updated(self, **settings: Any) -> "TrainConfig":
-        """Return a copy with other values of some settings, of any group; `model` may be whole, too.
+        """Return a copy with other values of some settings, of any group; `model` and `own` may be whole, too.
 
         Raises `InvalidInput` naming a setting that is unknown or out of range.
         """
@@ -129,8 +143,10 @@ class TrainConfig:
             whole = settings.pop("model")
             whole = whole if isinstance(whole, ModelConfig) else ModelConfig.from_dict(whole)
             config = dataclasses.replace(config, model=whole)
+        if "own" in settings:
+            config = dataclasses.replace(config, own=settings.pop("own"))
         for name, value in settings.items():
-            groups.setdefault(_group_of(name), {})[name] = value
+            groups.setdefault(config._group_of(name), {})[name] = value
         model = groups.pop("model")
         changed: dict[str, Any] = {n: dataclasses.replace(getattr(config, n), **v) for n, v in groups.items()}
         if model:
@@ -148,21 +164,39 @@ class TrainConfig:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> "TrainConfig":
-        """The inverse of `to_dict`. Raises `InvalidInput` naming a setting that is unknown or out of range."""
+        """The inverse of `to_dict`. Raises `InvalidInput` naming a setting that is unknown or out of range, or a system
+        that isn't registered, if there are settings of its own."""
         config, names = cls(), {item.name for item in fields(cls)}
         unknown = sorted(set(values) - names)
         if unknown:
             raise InvalidInput("config", f"made of the groups {', '.join(sorted(names))}", f"`{unknown[0]}`")
+        if values.get("own"):
+            config = config.updated(own=_own_type(values.get("run", {}).get("system"))())
         settings = {name: value for group, part in values.items() if group != "model" for name, value in part.items()}
         return config.updated(model=ModelConfig.from_dict(values.get("model", {})), **settings)
 
+    def _group_of(self, name: str) -> str:
+        for item in fields(self):
+            if any(field.name == name for field in fields(getattr(self, item.name))):
+                return item.name
+        raise InvalidInput("config", "made of known settings", f"`{name}`")
 
-def _group_of(name: str) -> str:
-    for item in fields(TrainConfig):
-        group = item.default
-        if any(field.name == name for field in fields(group)):  # type: ignore[arg-type]
-            return item.name
-    raise InvalidInput("config", "made of known settings", f"`{name}`")
+    def require_unique_names(self) -> None:
+        """Raise `InvalidInput` if a system's own setting has a name of another group."""
+        for name in self.own.names():
+            if (group := self._group_of(name)) != "own":
+                raise InvalidInput(
+                    f"config.{name}", f"of another name: the group {group} has it", type(self.own).__name__
+                )
+
+
+def _own_type(system: Any) -> type[SystemConfig]:
+    if system not in OWN_SETTINGS:
+        load_plugins()
+    if system not in OWN_SETTINGS:
+        known = ", ".join(OWN_SETTINGS)
+        raise InvalidInput("config.system", f"one of {known}; others come with --plugin MODULE", system)
+    return OWN_SETTINGS[system]
 
 
 RESUMABLE_CHANGES = frozenset({"steps", "threads", "device", "minutes", "log_every", "eval_every", "checkpoint_every"})

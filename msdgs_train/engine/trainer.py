@@ -30,7 +30,6 @@ FORMAT = "msdgs-checkpoint/3"
 MAX_SKIPPED_IN_A_ROW = 20
 ROLLBACK_LR = 0.5  # factor of the learning rates, each time that training returns to a checkpoint
 ROLLBACK_SEED = 1_000_003  # added to the seed of the images' order
-MAX_GRADIENT_NORM = 1.0  # of networks and grids; typical norms are 0.05 to 0.6
 SMOOTHING = 0.98  # of the reported loss and PSNR: a moving average over about 50 steps
 
 
@@ -96,8 +95,10 @@ class Trainer:
         self.optimizer_steps += 1
         is_finite = self._is_finite(loss, [p.grad for g in groups for p in g.params if p.grad is not None])
         if is_finite:
-            # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
-            clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], MAX_GRADIENT_NORM)
+            clip = self.config.optimizer.gradient_clip
+            if clip is not None:
+                # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
+                clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], clip)
             self.optimizer.step()
             self._average(views)
         self.system.after_step(

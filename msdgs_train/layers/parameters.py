@@ -11,11 +11,12 @@ class LearningRate(NamedTuple):
     init: float
     final: float
     holds: bool = False  # whether it stays at `init` until all times take part
+    until: float = 1.0  # fraction of the run at which it reaches `final`
 
     def at(self, step: float, num_steps: int, full_window_step: int) -> float:
         """The rate of one step of a run."""
         held = full_window_step if self.holds else 0
-        return exponential(self.init, self.final, max(step - held, 0), num_steps - held)
+        return exponential(self.init, self.final, max(step - held, 0), self.until * num_steps - held)
 
 
 def constant(rate: float) -> LearningRate:

@@ -8,6 +8,7 @@ import importlib
 import importlib.metadata
 import importlib.util
 import os
+import pkgutil
 import sys
 import traceback
 from collections.abc import Iterator
@@ -18,6 +19,8 @@ from pathlib import Path
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.writing import in_words
 
+SYSTEMS = "msdgs_train.systems"
+"""The package whose modules register the systems of this project, as plugins do theirs."""
 GROUP = "msdgs.plugins"
 VARIABLE = "MSDGS_PLUGINS"
 IMPORTERS = (__file__, importlib.__file__, importlib.metadata.__file__)
@@ -38,7 +41,9 @@ def add_plugin(name: str) -> None:
 
 @cache
 def load_plugins() -> None:
-    """Import all plugins, once a process."""
+    """Import this project's systems and all plugins, once a process."""
+    for module in pkgutil.iter_modules(importlib.import_module(SYSTEMS).__path__):
+        importlib.import_module(f"{SYSTEMS}.{module.name}")
     for entry in importlib.metadata.entry_points(group=GROUP):
         with _named(entry.value):
             entry.load()

@@ -76,7 +76,7 @@ class GaussianSplatting:
     def parameter_groups(self) -> list[ParamGroup]:
         o, g = self.config.optimizer, self.model.gaussians
         rates: dict[str, LearningRate] = {
-            "means": LearningRate(o.means_lr_init, o.means_lr_final),
+            "means": LearningRate(o.means_lr_init, o.means_lr_final, until=o.means_lr_until_fraction),
             "log_scales": constant(o.scales_lr),
             "raw_quats": constant(o.quats_lr),
             "raw_opacities": constant(o.opacities_lr),

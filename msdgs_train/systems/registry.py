@@ -3,18 +3,15 @@
 A system is one file in this folder, or a plugin, that calls `register_system`.
 """
 
-import importlib
-import pkgutil
 from collections.abc import Callable
-from functools import cache
 from typing import NamedTuple
 
-import msdgs_train.systems
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import SceneData
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.plugins import load_plugins
+from msdgs_train.settings import OWN_SETTINGS
 from msdgs_train.systems.base import System
 
 DEFAULT = "msdgs-nodes"
@@ -35,19 +32,17 @@ _ENTRIES: dict[str, SystemEntry] = {}
 def register_system(
     name: str, description: str, config: TrainConfig, build: Callable[[Schedule, SceneData], System] | None = None
 ) -> None:
-    """Register a system under its name."""
+    """Register a system under its name; it may have settings of its own in `config.own`.
+
+    Raises `InvalidInput` if one of those has the name of another setting.
+    """
+    config.require_unique_names()
+    OWN_SETTINGS[name] = type(config.own)
     _ENTRIES[name] = SystemEntry(name, description, config.updated(system=name), build)
-
-
-@cache
-def _load_own() -> None:
-    for module in pkgutil.iter_modules(msdgs_train.systems.__path__):
-        importlib.import_module(f"msdgs_train.systems.{module.name}")
 
 
 def systems() -> dict[str, SystemEntry]:
     """All systems by name, those of plugins included; the default first."""
-    _load_own()
     load_plugins()
     return {DEFAULT: _ENTRIES[DEFAULT]} | _ENTRIES
 

@@ -23,6 +23,7 @@ from msdgs_train.layers.base import (
 )
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.registry import register_layer
+from msdgs_train.settings import SystemConfig
 from msdgs_train.systems.base import Moment, Target, ViewLoss
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from msdgs_train.systems.registry import register_system
@@ -84,8 +85,15 @@ register_layer(FourierConfig)
 
 
 # system
-MOTION_WEIGHT = 0.01
-"""Weight of the mean displacement of Gaussians, per scene unit."""
+@dataclass(frozen=True)
+class SparseConfig(SystemConfig):
+    """Settings of sparse motion."""
+
+    motion_weight: float = 0.01
+    """Weight of the mean displacement of Gaussians, per scene unit."""
+
+    def __post_init__(self) -> None:
+        self.require_weights("motion_weight")
 
 
 class SparseMotion(GaussianSplatting):
@@ -95,14 +103,17 @@ class SparseMotion(GaussianSplatting):
         view = super().loss(frame, target, background, moment)
         if not self.schedule.deforms(moment.step):
             return view
+        assert isinstance(self.config.own, SparseConfig)
         displacement = self.model.pose(frame.t).means - self.model.gaussians.means
-        return view._replace(loss=view.loss + MOTION_WEIGHT * displacement.abs().mean())
+        return view._replace(loss=view.loss + self.config.own.motion_weight * displacement.abs().mean())
 
 
 register_system(
     "sparse-fourier",
     "two Fourier layers and sparse motion",
-    TrainConfig().updated(model=ModelConfig(sh_degree=2, layers=(FourierConfig(), FourierConfig(frequencies=8)))),
+    TrainConfig().updated(
+        model=ModelConfig(sh_degree=2, layers=(FourierConfig(), FourierConfig(frequencies=8))), own=SparseConfig()
+    ),
     build=SparseMotion,
 )
 

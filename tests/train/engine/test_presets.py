@@ -2,21 +2,26 @@
 
 import dataclasses
 import json
+import pickle
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import torch
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.cli.fit import parse_fit
 from msdgs_train.datasets import load_scene
-from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.config import TrainConfig, check_resumable
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.modulation import EMBEDDINGS
-from msdgs_train.systems.registry import DEFAULT, preset, systems
+from msdgs_train.settings import SystemConfig
+from msdgs_train.systems import registry
+from msdgs_train.systems.registry import DEFAULT, preset, register_system, systems
 from tests.support.training_scene import shrunk, small_config, splatting
 
 pytestmark = pytest.mark.slow
@@ -101,6 +106,7 @@ def test_each_preset_trains(name: str, data: Path) -> None:
     ("field", "value"),
     [
         ("steps", 0), ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
+        ("adam_beta2", 1.0), ("adam_eps", 0.0), ("gradient_clip", 0.0), ("means_lr_until_fraction", 0.0),
         ("mse_fraction", 1.1), ("alpha_weight", -1.0), ("prune_unseen_passes", -1.0),
         ("init_min_views", 1.1), ("ema_fraction", -0.1),
         ("max_gaussians", 10), ("background", "green"), ("minutes", 0.0), ("refine_every_fraction", -0.1),
@@ -113,6 +119,46 @@ def test_each_preset_trains(name: str, data: Path) -> None:
 def test_settings_out_of_range_are_named(field: str, value: object) -> None:
     with pytest.raises(InvalidInput, match=f"`config.{field}`"):
         TrainConfig().updated(**{field: value})
+
+
+@dataclass(frozen=True)
+class OwnConfig(SystemConfig):
+    stage_steps: tuple[int, ...] = (1, 2)
+    elastic_weight: float = 0.5
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stage_steps", tuple(self.stage_steps))
+        self.require_weights("elastic_weight")
+
+
+def test_a_system_may_have_settings_of_its_own(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(registry, "_ENTRIES", dict(registry._ENTRIES))
+    register_system("own", "with settings of its own", small_config(own=OwnConfig(), steps=1))
+    config = preset("own").updated(elastic_weight=0.25, stage_steps=[3])
+    assert config.own == OwnConfig((3,), 0.25)
+    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert pickle.loads(pickle.dumps(config)) == config
+    with pytest.raises(InvalidInput, match=r"`config\.elastic_weight`"):
+        config.updated(elastic_weight=-1.0)
+    with pytest.raises(InvalidInput, match=r"`config\.elastic_weight` must be 0\.25, as when the run was started"):
+        check_resumable(config, config.updated(elastic_weight=0.5))
+    with pytest.raises(SystemExit):
+        parse_fit(["--preset", "own", "--help"])
+    assert "--elastic-weight" in capsys.readouterr().out
+    fit = parse_fit([str(data), str(tmp_path / "run"), "--preset", "own", "--elastic-weight", "0.75", "--eval-every=0"])
+    assert fit.execute() == 0
+    assert parse_fit([str(data), str(tmp_path / "run"), "--resume"]).config.own == OwnConfig(elastic_weight=0.75)
+
+
+def test_own_settings_have_names_of_their_own() -> None:
+    @dataclass(frozen=True)
+    class Taken(SystemConfig):
+        steps: int = 5
+
+    with pytest.raises(InvalidInput, match=r"`config\.steps` must be of another name: the group run has it, got Taken"):
+        register_system("taken", "", small_config(own=Taken()))
 
 
 def test_settings_survive_json_and_unknown_ones_are_refused() -> None:

@@ -16,7 +16,6 @@ from msdgs_train.datasets import Frame, load_scene
 from msdgs_train.density import config as density_module
 from msdgs_train.density.gradient import GradientStrategy
 from msdgs_train.engine import schedule as schedule_module
-from msdgs_train.engine import trainer as trainer_module
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.gradients import average_gradients
 from msdgs_train.engine.metrics_log import MetricsLog, read_metrics
@@ -127,9 +126,7 @@ def test_resuming_changes_no_bit(
         assert lines[0] == lines[1]
 
 
-def test_each_image_has_random_numbers_of_its_own(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_image_has_random_numbers_of_its_own(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither threads nor a resumed run change them."""
     drawn: dict[int, set[float]] = {}
     original = GaussianSplatting.loss
@@ -316,7 +313,7 @@ def test_an_outlier_of_a_gradient_is_clipped(data: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: 1e9 * (rgb - target).sum() ** 2)
     trainer = trained(small_config(steps=100, static_fraction=0.0), load_scene(data), 3)
     gradients = [p.grad for p in splatting(trainer).model.deformation.parameters() if p.grad is not None]
-    assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer_module.MAX_GRADIENT_NORM)
+    assert torch.nn.utils.get_total_norm(gradients) == pytest.approx(trainer.config.optimizer.gradient_clip)
 
 
 def test_learning_rates(data: Path) -> None:
