@@ -11,6 +11,8 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.scenes import SPLITS, Scene
 from msdgs_train.comparison.tables import read_tables, require_unique
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.layers.parts import to_text
 from msdgs_train.settings import optional
 from msdgs_train.systems.registry import DEFAULT, preset, systems
 
@@ -36,6 +38,8 @@ class Budget:
     """Initial Gaussians of all systems; their own settings if not given."""
     max_gaussians: Annotated[int | None, optional("INT")] = None
     """Maximum Gaussians of all systems; their own settings if not given."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """As in `fit`."""
     threads: int = 1
     """CPU threads of each run."""
     time: Literal["wall", "cpu"] = "wall"
@@ -46,7 +50,7 @@ class Budget:
         steps = DEFAULT_STEPS if self.steps is None and self.minutes is None else self.steps
         shared = {name: getattr(self, name) for name in ("size", "time_from", "init_num_pts", "max_gaussians")}
         given = {name: value for name, value in {"steps": steps, **shared}.items() if value is not None}
-        config = config.updated(minutes=self.minutes, threads=self.threads, time=self.time, **given)
+        config = config.updated(minutes=self.minutes, threads=self.threads, time=self.time, device=self.device, **given)
         every = max(config.run.steps // EVALUATIONS, 1)
         logged = max(config.run.steps // LOG_LINES, 1)
         return config.updated(eval_every=every, checkpoint_every=every, log_every=logged)
@@ -64,7 +68,7 @@ class Run:
     config: TrainConfig
     settings: str
     """Eight digits that change with any setting of the system, the scene and the command besides the budget's time and
-    threads."""
+    threads. Settings at their defaults don't count, so that new settings leave them as they are."""
     splits: tuple[str, ...] = SPLITS
     """Held-out images whose metrics are reported."""
 
@@ -80,7 +84,7 @@ def read_systems(sources: Sequence[str], budget: Budget) -> dict[str, TrainConfi
     Raises `InvalidInput` naming the file, the system and the invalid setting.
     """
     tables = [pair for source in sources for pair in _tables(source)]
-    configs = [(name, _config(name, table, budget)) for name, table in tables]
+    configs = [(name, read_system(name, table, budget)) for name, table in tables]
     require_unique("system", (name for name, _ in configs))
     return dict(configs)
 
@@ -101,9 +105,18 @@ def make_runs(
 
 
 def _digest(config: TrainConfig, scene: Scene) -> str:
-    same = config.updated(seed=0, minutes=None, threads=1, time="wall").to_dict()
-    values = [same, dict(scene.settings), scene.splits]
+    values = [_changed(config.updated(seed=0, minutes=None, time="wall")), dict(scene.settings), scene.splits]
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _changed(config: TrainConfig) -> dict[str, Any]:
+    """By group, the settings besides threads that differ from their defaults."""
+    default, changed = TrainConfig().updated(model=ModelConfig()).to_dict(), config.to_dict()
+    del changed["run"]["threads"]
+    for group, values in changed.items():
+        changed[group] = {n: v for n, v in values.items() if n not in default[group] or v != default[group][n]}
+    parts = {"support": to_text(config.model.support), "layers": [to_text(layer) for layer in config.model.layers]}
+    return changed | {"model": changed["model"] | parts}
 
 
 def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
@@ -115,7 +128,11 @@ def _tables(source: str) -> list[tuple[str, Mapping[str, Any]]]:
     return list(read_tables("config", path).items())
 
 
-def _config(name: str, table: Mapping[str, Any], budget: Budget) -> TrainConfig:
+def read_system(name: str, table: Mapping[str, Any], budget: Budget) -> TrainConfig:
+    """The settings of a system: a `preset` and others that replace its own, under a budget.
+
+    Raises `InvalidInput` naming the system and the invalid setting.
+    """
     changes = {key: value for key, value in table.items() if key != "preset"}
     try:
         return budget.of(preset(table.get("preset", DEFAULT)).updated(**changes))

@@ -15,6 +15,7 @@ from msdgs_train.comparison.runner import final_metrics, is_finished
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.engine.run import EVAL_SPLITS
 from msdgs_train.engine.run_record import MODEL
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 
@@ -56,13 +57,14 @@ def _result(run: Run) -> Result:
     split = next(name for name in EVAL_SPLITS if name in metrics["splits"] and name in run.splits)
     lines = read_metrics(run.folder)
     loaded = load_model(run.folder / MODEL)
+    deformation, modulation = parameter_counts(loaded.model)
     return Result(
         run=run,
         split=split,
         psnr=metrics["splits"][split]["psnr"],
         ssim=metrics["splits"][split]["ssim"],
-        deformation_parameters=sum(p.numel() for p in loaded.model.deformation.parameters()),
-        modulation_parameters=_modulation_parameters(loaded),
+        deformation_parameters=deformation,
+        modulation_parameters=modulation,
         gaussians=metrics["gaussians"],
         seconds=metrics["seconds"],
         skipped=max((line["skipped"] for line in lines if line["kind"] == "train"), default=0),
@@ -71,11 +73,13 @@ def _result(run: Run) -> Result:
     )
 
 
-def _modulation_parameters(loaded: LoadedModel) -> int:
-    model = loaded.model
+def parameter_counts(model: DynamicGaussians) -> tuple[int, int]:
+    """Trainable numbers of the deformation, and of the modulation with its embeddings."""
+    deformation = sum(p.numel() for p in model.deformation.parameters())
     if model.modulation is None:
-        return 0
-    return model.gaussians.attributes[EMBEDDINGS].numel() + sum(p.numel() for p in model.modulation.parameters())
+        return deformation, 0
+    modulation = sum(p.numel() for p in model.modulation.parameters())
+    return deformation, modulation + model.gaussians.attributes[EMBEDDINGS].numel()
 
 
 def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:

@@ -16,18 +16,21 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import write_text
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import Pool, RunEnd
+from msdgs_train.comparison.results import parameter_counts
 from msdgs_train.comparison.runner import final_metrics, train_all
 from msdgs_train.comparison.scenes import SPLITS
 from msdgs_train.engine.metrics_log import read_metrics
-from msdgs_train.evaluation.evaluate import evaluate_run
+from msdgs_train.evaluation.evaluate import Evaluation, evaluate_run
 
 KEY = ("scene", "system", "seed", "minutes", "time", "threads", "settings")
 COLUMNS = (
-    "date", "machine", *KEY, "seconds", "optimizer_steps", "gaussians", "train_psnr",
-    *(f"{split}_{name}" for split in SPLITS for name in ("psnr", "ssim", "lpips", "moving_psnr", "images")),
+    "date", "machine", *KEY, "seconds", "optimizer_steps", "gaussians", "parameters", "modulation_parameters",
+    "train_psnr",
+    *(f"{split}_{name}" for split in SPLITS for name in ("psnr", "ssim", "lpips", "lpips_01", "moving_psnr", "images")),
 )  # fmt: skip
-"""`*_images` has the PSNR of each image, in order; `*_moving_psnr` only where the region is known from the images;
-`train_psnr` is the moving average of the last steps."""
+"""`parameters` are those of the deformation; those of the modulation, embeddings included, are apart. `*_images` has
+the PSNR of each image, in order; `*_moving_psnr` only where the region is known from the images; `train_psnr` is the
+moving average of the last steps."""
 
 Row = dict[str, str]
 
@@ -76,9 +79,9 @@ def train_and_measure(
     """Train the runs that have no row in the file, and add their rows; returns False if Ctrl-C has stopped it."""
 
     def finish(run: Run, end: RunEnd) -> None:
-        on_end(run, end)
         if end.status in ("finished", "was finished"):
             append_row(csv_file, measure(run))
+        on_end(run, end)
 
     return train_all(runs_left(runs, csv_file), pool, finish)
 
@@ -107,8 +110,11 @@ def measure(run: Run) -> Row:
         "train_psnr": f"{[line for line in read_metrics(run.folder) if line['kind'] == 'train'][-1]['psnr']:.3f}",
     }
     for split in SPLITS:
-        found = split in run.splits and split in metrics["splits"]
-        row |= {f"{split}_{name}": value for name, value in (_scores(run, split) if found else {}).items()}
+        if split in run.splits and split in metrics["splits"]:
+            evaluation = evaluate_run(run.folder, run.data, split, brief=True)
+            counts = parameter_counts(evaluation.models[0].loaded.model)
+            row |= dict(zip(("parameters", "modulation_parameters"), map(str, counts), strict=True))
+            row |= {f"{split}_{name}": value for name, value in _scores(evaluation).items()}
     return {name: row.get(name, "") for name in COLUMNS}
 
 
@@ -117,11 +123,10 @@ def _machine(device: str) -> str:
     return f"{get_host_cpu_name()} {os.cpu_count()} cores{gpu}"
 
 
-def _scores(run: Run, split: str) -> dict[str, str]:
-    evaluation = evaluate_run(run.folder, run.data, split, brief=True)
+def _scores(evaluation: Evaluation) -> dict[str, str]:
     (model,) = evaluation.models
     mean = model.mean
     moving = mean.moving_psnr if evaluation.region_source == "images" else None
-    numbers = {"psnr": mean.psnr, "ssim": mean.ssim, "lpips": mean.lpips, "moving_psnr": moving}
+    numbers = {name: getattr(mean, name) for name in ("psnr", "ssim", "lpips", "lpips_01")} | {"moving_psnr": moving}
     texts = {name: f"{value:.4f}" for name, value in numbers.items() if value is not None}
     return texts | {"images": " ".join(f"{image.psnr:.2f}" for image in model.images)}

@@ -26,7 +26,8 @@ class Scores(NamedTuple):
 
     psnr: float  # dB, data range 1
     ssim: float  # window 11, σ = 1.5
-    lpips: float | None  # VGG-16
+    lpips: float | None  # VGG-16, of images scaled to [−1, 1], its definition
+    lpips_01: float | None  # of images in [0, 1], as the field's scripts
     flip: float | None  # mean ꟻLIP
     moving_psnr: float | None  # dB, over the pixels of the moving region; None if nothing moves
 
@@ -122,7 +123,8 @@ def scores(
     if counts is not None:
         rgb, moving = filled(rgb, target, torch.from_numpy(counts)), moving & counts
     others = {name: metric(rgb, target) for name, metric in perceptual.metrics.items()}
-    return Scores(psnr, ssim, others.get("lpips"), others.get("flip"), masked_psnr(rgb, target, moving))
+    lpips, lpips_01, flip = (others.get(name) for name in ("lpips", "lpips_01", "flip"))
+    return Scores(psnr, ssim, lpips, lpips_01, flip, masked_psnr(rgb, target, moving))
 
 
 def _data_folder(run: Path, data: Path | None) -> Path:

@@ -1,4 +1,9 @@
-"""LPIPS and ꟻLIP: metrics of other packages, if these are installed. Nothing is downloaded."""
+"""LPIPS and ꟻLIP: metrics of other packages, if these are installed. Nothing is downloaded.
+
+LPIPS has two conventions: `lpips` is its definition, the distance of images scaled to [−1, 1] (Zhang et al. 2018);
+`lpips_01` is what the scripts of 3D Gaussian Splatting and of systems after it report, the same network on images left
+in [0, 1], which gives lower values.
+"""
 
 import importlib
 import pickle
@@ -25,28 +30,29 @@ class PerceptualMetrics(NamedTuple):
 
 
 def perceptual_metrics(*, with_flip: bool = True) -> PerceptualMetrics:
-    """Load `lpips` and `flip`, each as a metric or with the reason why it is unavailable."""
+    """Load `lpips` with `lpips_01`, and `flip`, or the reason why they are unavailable."""
     found = PerceptualMetrics({}, {})
-    loaders = {"lpips": _load_lpips} | ({"flip": _load_flip} if with_flip else {})
-    for name, load in loaders.items():
+    loaders = {("lpips", "lpips_01"): _load_lpips} | ({("flip",): _load_flip} if with_flip else {})
+    for names, load in loaders.items():
         try:
-            found.metrics[name] = load()
+            found.metrics.update(load())
         except Unavailable as error:
-            found.unavailable[name] = str(error)
+            found.unavailable.update(dict.fromkeys(names, str(error)))
     return found
 
 
-def _load_flip() -> Metric:
+def _load_flip() -> dict[str, Metric]:
     """NVIDIA's LDR-ꟻLIP, mean over the pixels, at its default of 67 pixels per degree."""
     evaluator = _module("flip_evaluator", "flip-evaluator")
-    return lambda rgb, target: float(evaluator.evaluate(target.numpy(), rgb.numpy(), "LDR", applyMagma=False)[1])
+
+    def metric(rgb: Tensor, target: Tensor) -> float:
+        return float(evaluator.evaluate(target.numpy(), rgb.numpy(), "LDR", applyMagma=False)[1])
+
+    return {"flip": metric}
 
 
-def _load_lpips() -> Metric:
-    """LPIPS with VGG-16, on images scaled to [−1, 1].
-
-    This is the definition of LPIPS. The scripts of 3D Gaussian Splatting pass [0, 1], which gives lower values.
-    """
+def _load_lpips() -> dict[str, Metric]:
+    """LPIPS with VGG-16, in both conventions."""
     models = _module("torchvision.models", "torchvision")
     name = models.VGG16_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[-1]
     weights = Path(torch.hub.get_dir()) / "checkpoints" / name
@@ -60,9 +66,9 @@ def _load_lpips() -> Metric:
 
     @torch.no_grad()
     def metric(rgb: Tensor, target: Tensor) -> float:
-        return float(network(*(2 * image.permute(2, 0, 1)[None] - 1 for image in (rgb, target))))
+        return float(network(*(image.permute(2, 0, 1)[None] for image in (rgb, target))))
 
-    return metric
+    return {"lpips": lambda rgb, target: metric(2 * rgb - 1, 2 * target - 1), "lpips_01": metric}
 
 
 def _module(name: str, package: str) -> Any:

@@ -26,6 +26,7 @@ HEADINGS = {
     "psnr": "PSNR, dB ↑",
     "ssim": "SSIM ↑",
     "lpips": "LPIPS ↓",
+    "lpips_01": "LPIPS of [0, 1] ↓",
     "flip": "ꟻLIP ↓",
     "moving_psnr": "moving PSNR, dB ↑",
 }

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from msdgs_train.comparison.matrix import Budget, Run, make_runs
 from msdgs_train.comparison.report import write_comparison
 from msdgs_train.comparison.rows import COLUMNS, KEY, Row, append_row, key_of, key_of_row, read_rows, rows_of
 from msdgs_train.comparison.scenes import read_scenes
+from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import preset
 from tests.support.processes import ROOT
 from tests.support.training_scene import write_scene
@@ -121,6 +123,7 @@ def test_the_same_command_goes_on_from_its_rows(data: Path, capsys: pytest.Captu
     assert shown == ["small", "tiny", "2", "cpu"]
     assert float(first["test_psnr"]) > 0
     assert len(first["val_images"].split()) > 0
+    assert (first["parameters"], first["modulation_parameters"]) == ("0", "0")
     assert cli.main([*command, f"--out={out}"]) == 0
     assert read_rows(rows) == [first]
     assert cli.main([*command, f"--out={data / 'other'}"]) == 0
@@ -166,6 +169,23 @@ def test_a_row_is_of_the_budget_and_of_all_settings(data: Path) -> None:
     changed = [make(data, dataclasses.replace(budget, **change))[0] for change in changes]
     assert len({key_of(run) for run in [known, *changed]}) == 1 + len(changes)
     assert [run.settings == known.settings for run in changed] == [True, True, True, False, False, False]
+    assert make(data, dataclasses.replace(budget, device="cuda"))[0].settings != known.settings
+
+
+def test_a_new_setting_leaves_rows_as_they_are(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Unless it is set: one at its default is one that an earlier version had not."""
+    (before, *_) = make(data, Budget())
+    to_dict = TrainConfig.to_dict
+
+    def extended(config: TrainConfig) -> dict[str, Any]:
+        values = to_dict(config)
+        values["loss"]["new_weight"] = 0.5 if config.run.steps == 7 else 0.0
+        return values
+
+    (seven, *_) = make(data, Budget(steps=7))
+    monkeypatch.setattr(TrainConfig, "to_dict", extended)
+    assert make(data, Budget())[0].settings == before.settings
+    assert make(data, Budget(steps=7))[0].settings != seven.settings
 
 
 def test_a_row_is_of_the_scenes_own_settings(tmp_path: Path) -> None:

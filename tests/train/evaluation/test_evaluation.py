@@ -261,13 +261,12 @@ def test_unavailable_metrics_are_null_with_a_reason(run: Path, monkeypatch: pyte
         monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(["eval", str(run)]) == 0
     report = json.loads((run / "eval" / "test.json").read_text())
-    assert set(report["unavailable"]) == {"lpips", "flip"}
+    assert set(report["unavailable"]) == {"lpips", "lpips_01", "flip"}
     for evaluated in report["models"].values():
         for scores in (evaluated["mean"], *evaluated["images"]):
-            assert scores["lpips"] is None
-            assert scores["flip"] is None
+            assert [scores[name] for name in ("lpips", "lpips_01", "flip")] == [None] * 3
     table = (run / "eval" / "test.md").read_text()
-    assert table.count("unavailable") >= 2 * 2 * 3
+    assert table.count("unavailable") >= 3 * 2 * 3
     assert "torchvision isn't installed" in table
     assert "flip-evaluator isn't installed" in table
 
@@ -282,7 +281,7 @@ def test_a_library_that_fails_on_import_costs_its_metric_only(monkeypatch: pytes
     assert "torchvision can't be used: operator" in perceptual_metrics().unavailable["lpips"]
 
 
-def test_lpips_needs_its_weights_on_disk_and_images_in_plus_minus_one(
+def test_lpips_needs_its_weights_on_disk_and_is_of_images_in_plus_minus_one_and_in_zero_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     weights = types.SimpleNamespace(IMAGENET1K_V1=types.SimpleNamespace(url="https://example.org/vgg16-1.pth"))
@@ -290,11 +289,12 @@ def test_lpips_needs_its_weights_on_disk_and_images_in_plus_minus_one(
     stand_in = types.SimpleNamespace(LearnedPerceptualImagePatchSimilarity=_StandInForLpips)
     monkeypatch.setitem(sys.modules, "torchmetrics.image.lpip", stand_in)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    assert "vgg16-1.pth" in perceptual_metrics().unavailable["lpips"]
+    assert "vgg16-1.pth" in perceptual_metrics().unavailable["lpips_01"]
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "vgg16-1.pth").touch()
-    metric = perceptual_metrics().metrics["lpips"]
-    assert metric(torch.zeros(6, 5, 3), torch.ones(6, 5, 3)) == 2.0
+    metrics = perceptual_metrics().metrics
+    images = torch.zeros(6, 5, 3), torch.ones(6, 5, 3)
+    assert (metrics["lpips"](*images), metrics["lpips_01"](*images)) == (2.0, 1.0)
 
 
 class _StandInForLpips:
