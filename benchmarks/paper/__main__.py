@@ -1,0 +1,179 @@
+"""`python -m benchmarks.paper TABLE`: a table of the paper, trained here."""
+
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from benchmarks.paper.tables import PaperBudget, Table, find_scenes, read_systems, read_table
+from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID, begin
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
+from msdgs_serve.writing import in_words, write_text
+from msdgs_train.cli.compare import comparison_progress
+from msdgs_train.cli.console import console
+from msdgs_train.comparison.matrix import make_runs
+from msdgs_train.settings import Flag, optional
+
+if TYPE_CHECKING:
+    from benchmarks.paper.page import Results
+    from msdgs_train.comparison.matrix import Run
+    from msdgs_train.comparison.pools import RunEnd
+
+Name = Literal["table1", "table2", "table3", "table4", "table5", "figure7"]
+
+
+@dataclass(frozen=True)
+class Paper:
+    """Train the systems of a table of the paper, and write a page with our numbers beside the published ones: PSNR,
+    SSIM, LPIPS in both conventions, gains with their intervals, parameters, steps, minutes, pictures side by side.
+
+    table1: eight systems on D-NeRF; table2: five on Neu3D; table3: four on HyperNeRF; table4: fewer parameters; table5:
+    without weights, and modulation of other deltas; figure7: numbers of layers. The last three are on D-NeRF, too.
+
+    The data are the folder of D-NeRF, Neu3D or HyperNeRF with a folder for each scene, single datasets, or TOML files
+    of scenes as for `msdgs-train compare`. Scenes that aren't there are dashes, others are added. Without --small each
+    system is trained as its authors publish it, which needs a GPU; --steps and --minutes shorten its schedule.
+
+    Each finished run adds a row to a CSV file and renews the page, OUT/TABLE.html and .md. Runs that have a row aren't
+    trained again, so that the same command continues after Ctrl-C, also for more seeds, scenes or systems. Tables share
+    the runs of OUT.
+
+    All on a GPU:  python -m benchmarks.paper table1 --data data/D-NeRF --device cuda
+
+    Shorter:  python -m benchmarks.paper table1 --data data/D-NeRF --device cuda --size 400 --minutes 30
+
+    On a CPU:  python -m benchmarks.paper table1 --data data/D-NeRF --small --size 200 --minutes 10 --time cpu
+
+    Two rows:  python -m benchmarks.paper table1 --data data/D-NeRF --device cuda --methods "Ours(MLP)" DeformGS
+    """
+
+    table: Annotated[Name, tyro.conf.Positional] = "table1"
+    """The table, or figure."""
+    data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="DATA...", help_behavior_hint="")] = ()
+    """Folders of scenes, datasets and TOML files of scenes, one or more."""
+    out: Path = Path("out/paper")
+    """The folder of runs and pages."""
+    csv: Annotated[Path | None, optional("PATH")] = None
+    """The file with a row per finished run; OUT/paper.csv if not given."""
+    docs: Annotated[Path | None, optional("PATH")] = None
+    """A copy of the page as Markdown."""
+    methods: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...", help_behavior_hint="")] = ()
+    """Rows of the table to train, as the paper writes them; all if not given. The page has all."""
+    scenes: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...", help_behavior_hint="")] = ()
+    """Scenes to train on; all if not given. The page has all."""
+    seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="INT...")] = (0,)
+    """One run per seed; the page has mean and standard deviation."""
+    small: Flag = False
+    """Systems in sizes for a CPU (systems.toml)."""
+    budget: Annotated[PaperBudget, tyro.conf.arg(name="")] = field(default_factory=PaperBudget)
+    jobs: Annotated[int, tyro.conf.arg(metavar="INT")] = 1
+    """Parallel runs."""
+    check: Flag = False
+    """Test this benchmark: two systems on a scene of a few pixels."""
+
+    def execute(self) -> int:
+        """Train what is missing, and write the page; returns the exit code."""
+        from benchmarks.paper.page import Results
+        from msdgs_train.comparison.pools import processes
+        from msdgs_train.comparison.rows import rows_of, runs_left, train_and_measure
+
+        if self.jobs < 1:
+            raise InvalidInput("jobs", "1 or more", self.jobs)
+        table = read_table(self.table)
+        self._check_names(table)
+        scenes = find_scenes(table, self.data)
+        trained, absent = read_systems(table, self.budget, small=self.small)
+        csv = self.csv or self.out / "paper.csv"
+        runs = make_runs(dict(trained.values()), scenes, self.seeds, self.out)
+        wanted = {system for method, (system, _) in trained.items() if method in self.methods or not self.methods}
+        chosen = [run for run in runs if run.system in wanted and (run.scene in self.scenes or not self.scenes)]
+        results = Results(table, trained, absent, scenes, runs, (), self.budget, self.small)
+
+        def write() -> None:
+            self._write(replace(results, rows=rows_of(runs, csv)))
+
+        left, complete = runs_left(chosen, csv), True
+        with comparison_progress(len(left)) as advance:
+
+            def on_end(run: "Run", end: "RunEnd") -> None:
+                advance(run, end)
+                write()
+
+            if left:
+                complete = train_and_measure(left, csv, processes(self.jobs), on_end)
+        write()
+        console.print(f"wrote {self.out / self.table}.html and .md; rows in {csv}", soft_wrap=True)
+        if not complete:
+            console.print("interrupted; the same command continues", soft_wrap=True)
+            return EXIT_INTERRUPTED
+        return EXIT_INVALID if runs_left(chosen, csv) else 0
+
+    def _check_names(self, table: Table) -> None:
+        known = [method.name for method in table.methods]
+        for name in self.methods:
+            if name not in known:
+                raise InvalidInput("methods", f"of {', '.join(known)}", name)
+
+    def _write(self, results: "Results") -> None:
+        from benchmarks.paper.page import sections
+        from benchmarks.paper.sections import as_html, as_markdown
+
+        self.out.mkdir(parents=True, exist_ok=True)
+        parts = list(sections(results))
+        text = as_markdown(results.title, parts)
+        write_text(self.out / f"{self.table}.html", as_html(results.title, parts))
+        for file in (self.out / f"{self.table}.md", *([self.docs] if self.docs else [])):
+            write_text(file, text)
+
+
+def self_test() -> int:
+    """Two systems on one of D-NeRF's scenes, small; then nothing is left to train."""
+    from tests.support.training_scene import write_scene
+
+    with tempfile.TemporaryDirectory() as folder:
+        out, budget = Path(folder) / "out", PaperBudget(steps=6, init_num_pts=60, max_gaussians=90)
+        write_scene(Path(folder) / "data" / "hook", train=3, test=1)
+        paper = Paper(
+            "table1", (Path(folder) / "data",), out, methods=("DeformGS", "Ours(MLP)"), small=True, budget=budget
+        )
+        assert paper.execute() == 0
+        rows = (out / "paper.csv").read_text(encoding="utf-8")
+        assert paper.execute() == 0
+        assert (out / "paper.csv").read_text(encoding="utf-8") == rows
+        text, page = ((out / f"table1.{kind}").read_text(encoding="utf-8") for kind in ("md", "html"))
+        first = next(line for line in text.splitlines() if line.startswith("| DeformGS |")).split("|")
+        assert first[2].strip() == "– / 41.01"
+        assert float(first[4].split("/")[0]) > 5
+        assert first[4].split("/")[1].strip() == "37.42"
+        assert "Ours(MLP) over DeformGS" in text
+        assert page.count("data:image/png") == 3
+        for name in ("table2", "table3", "table4", "table5", "figure7"):
+            assert read_table(name).methods
+    console.print("ok")
+    return 0
+
+
+@contextmanager
+def errors_in_words() -> Iterator[None]:
+    """Invalid input as a line, and exit codes as those of `msdgs-train`."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted")
+        sys.exit(EXIT_INTERRUPTED)
+    except (MsdgsError, OSError) as error:
+        Console(stderr=True).print(f"error: {in_words(error)}", style="red", markup=False, highlight=False)
+        sys.exit(EXIT_INVALID)
+
+
+if __name__ == "__main__":
+    begin()
+    with errors_in_words():
+        options = tyro.cli(Paper, prog="python -m benchmarks.paper")
+        sys.exit(self_test() if options.check else options.execute())
