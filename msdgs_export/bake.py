@@ -1,17 +1,20 @@
 """Baking: the constants of a scene file, computed from a trained model in float32."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
 
 from msdgs_export.layers.graph import to_numpy
 from msdgs_serve import __version__
+from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.gaussians import FloatArray
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import EMBEDDINGS
+from msdgs_train.gaussians.raw_quaternions import QuatSpace
 from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import DeformationLayer
@@ -59,6 +62,7 @@ class Baked:
     moving: Moving
     layers: tuple[DeformationLayer, ...]  # float32; empty if nothing moves
     support: Support = field(default_factory=lambda: GaussiansConfig().build())
+    quat_space: QuatSpace = "unit"
 
 
 def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Baked:
@@ -82,7 +86,7 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
         **{name: values[len(moving) if name in moving.appearance else 0 :] for name, values in appearance.items()},
         changing=tuple(moving.appearance),
     )
-    return Baked(scene.validate("the baked scene"), moving, layers, model.support)
+    return Baked(scene.validate("the baked scene"), moving, layers, model.support, model.config.quat_space)
 
 
 def _moving(model: DynamicGaussians) -> Moving:
@@ -115,7 +119,7 @@ def _metadata(
         background=info.background,
         antialiasing="dilate",
         cameras=starting_cameras(info),
-        left_out=(),
+        left_out=limits_left_out(model, len(model.gaussians)),
         measured_error={},
         package_version=__version__,
         checkpoint_sha256=checkpoint_sha256,
@@ -124,6 +128,18 @@ def _metadata(
     )
     # through the reader of scene files, which refuses invalid values
     return SceneMetadata.from_properties(draft.to_properties(), "the model's scene")
+
+
+def limits_left_out(model: DynamicGaussians, count: int) -> tuple[dict[str, Any], ...]:
+    """Limits of the rasterizer that a model of so many Gaussians was trained with, which scene files don't hold."""
+    trained = model.rasterizer
+    if (trained.near_plane, trained.alpha_max) == (GSPLAT.near_plane, GSPLAT.alpha_max):
+        return ()
+    what = (
+        f"near plane {trained.near_plane:g} and largest alpha {trained.alpha_max:g} of training, "
+        f"where readers have {GSPLAT.near_plane:g} and {GSPLAT.alpha_max:g}"
+    )
+    return ({"rule": "rasterizer", "what": what, "count": count, "of": count},)
 
 
 def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:

@@ -11,6 +11,7 @@ from msdgs_export.bake import Baked
 from msdgs_export.layers.base import heads_of
 from msdgs_export.layers.graph import GraphBuilder
 from msdgs_export.plans.base import Plan
+from msdgs_export.plans.ellipsoids import ellipsoids
 from msdgs_export.plans.scene_graph import changing_output, finished, new_graph, unit_quats
 from msdgs_export.supports import Layout, SupportInputs, support_export_of
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
@@ -46,8 +47,12 @@ def _deform(graph: GraphBuilder, baked: Baked, layout: Layout | None) -> None:
         poses = {name: rows.output(name) for name in MOVING_OUTPUTS}
         operator = ("Add", [means, parts["means"]]) if "means" in parts else ("Identity", [means])
         graph.node(*operator, poses["means"])
-        _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space, poses["scales"])
+        is_raw = baked.quat_space == "raw" and "quats" in parts
+        scales = "raw_scales" if is_raw else poses["scales"]
+        _scales(graph, log_scales, parts.get("scales"), baked.scene.metadata.delta_space, scales)
         raw_quats = graph.node("Add", [quats, parts["quats"]], "raw_quats") if "quats" in parts else quats
+        if is_raw:
+            raw_quats = ellipsoids(graph, raw_quats, scales, poses["scales"])
         unit_quats(graph, raw_quats, poses["quats"])
         for name, values in moving.appearance.items():
             deltas = parts.get(name)

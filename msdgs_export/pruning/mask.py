@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from msdgs_export.bake import Baked, bake
+from msdgs_export.bake import Baked, bake, limits_left_out
 from msdgs_export.layers import export_of
 from msdgs_export.measure.poses import posed
 from msdgs_export.spatial_order import morton_order
@@ -102,9 +102,10 @@ def bake_pruned(pruned: PrunedModel, info: SceneInfo, checkpoint_sha256: str) ->
     """Bake the moving part of a pruned model, and add its static Gaussians."""
     baked = bake(pruned.moving, info, checkpoint_sha256)
     scene, static = baked.scene, pruned.static
+    limits = limits_left_out(pruned.moving, len(pruned.moving.gaussians) + len(static))
     scene = replace(
         scene,
-        metadata=replace(scene.metadata, left_out=pruned.left_out),
+        metadata=replace(scene.metadata, left_out=(*limits, *pruned.left_out)),
         static_means=np.concatenate([scene.static_means, static.means]),
         static_quats=np.concatenate([scene.static_quats, static.quats]),
         static_scales=np.concatenate([scene.static_scales, static.scales]),

@@ -9,6 +9,7 @@ import torch
 from msdgs_export.bake import DELTA_SPACES, Baked
 from msdgs_export.layers import HEAD_COLUMNS, HEADS
 from msdgs_export.measure.poses import operations
+from msdgs_train.gaussians.raw_quaternions import unit_form
 from msdgs_train.gaussians.scale_space import ScaleSpace, add_to_scales
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.layers.quaternions import unit_or_identity
@@ -28,6 +29,7 @@ class ExactPoses:
         m = baked.moving
         self.count = len(m)
         self._space: ScaleSpace = "log" if baked.scene.metadata.delta_space == DELTA_SPACES["log"] else "linear"
+        self._is_raw = baked.quat_space == "raw"
         self._means, self._log_scales, self._quats = (
             torch.from_numpy(a).double() for a in (m.means, m.log_scales, m.quats)
         )
@@ -54,4 +56,7 @@ class ExactPoses:
             for head in HEADS  # equation 12
         )
         scales = add_to_scales(self._space, log_scales, of_scales)
-        return torch.cat([means + of_means, scales, unit_or_identity(quats + of_quats)], dim=1).numpy()
+        quats = quats + of_quats
+        if self._is_raw:
+            quats, scales = unit_form(quats, scales)
+        return torch.cat([means + of_means, scales, unit_or_identity(quats)], dim=1).numpy()

@@ -20,6 +20,8 @@ class DensityConfig(Checked):
     """Gaussians at the start: the dataset's sparse points, at most so many, or random in a cube around the origin."""
     init_min_views: float = 0.0
     """Random Gaussians start where at least this fraction of the cameras sees them."""
+    init_gray: Annotated[float | None, optional("GRAY")] = None
+    """Random Gaussians start with this gray, 0 to 1; with random colors if not given."""
     max_gaussians: Annotated[int | None, optional("INT")] = 10_000
     """Upper bound of the number of Gaussians; those with the largest gradients are densified first. If not
     given: 0.45 per pixel of a training image, but 18,000 to 100,000."""
@@ -63,6 +65,7 @@ class DensityConfig(Checked):
         self.require_counts("init_num_pts")
         self.require_fractions("refine_start_fraction", "refine_every_fraction", "refine_stop_fraction")
         self.require_fractions("reset_every_fraction", "prune_opa", "init_min_views")
+        self.require_fractions(*(["init_gray"] if self.init_gray is not None else []))
         self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
         self.require_weights("noise_lr", "prune_unseen_passes")
         self.require_weights(*(n for n in ("opacity_reg", "scale_reg") if getattr(self, n) is not None))

@@ -111,7 +111,7 @@ class GradientStrategy(DensityStrategy):
         pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
         if self.patience:
             pruned |= self.unseen > self.patience
-        if 0 < self.schedule.reset_every < step:
+        if self.schedule.has_reset(step):
             pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.scene_scale
         if bool(pruned.all()):  # a scene that is wholly transparent keeps its Gaussians and may recover
             return torch.zeros_like(pruned)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from msdgs_train.settings import Checked
+from msdgs_train.settings import Checked, Flag
 
 HALVED_WIDTH = 320
 """Narrower images always have their full size, in pixels."""
@@ -25,8 +25,18 @@ class CurriculumConfig(Checked):
     half_resolution_fraction: float = 0.0
     """The first fraction of the run trains on images of half the width and height if they are 320 pixels wide or more:
     its steps are faster and add fewer Gaussians."""
+    restart_at_motion: Flag = False
+    """Adam, its learning rates and the steps that density control counts start again when motion begins: the two stages
+    of 4DGaussians."""
+    time_noise: float = 0.0
+    """Standard deviation of the noise on the times of training images at the start, in distances between them, as
+    Deformable-3D-Gaussians adds to real scenes (0.1)."""
+    time_noise_fraction: float = 0.5
+    """Fraction of the run after which that noise has fallen to 0."""
 
     def __post_init__(self) -> None:
         self.require_fractions("static_fraction", "static_window_fraction", "window_full_fraction")
-        self.require_fractions("half_resolution_fraction")
+        self.require_fractions("half_resolution_fraction", "time_noise_fraction")
+        self.require_weights("time_noise")
+        self.require(("restart_at_motion",), "true or false", lambda v: type(v) is bool)
         self.require(("window_start_width",), "in [0, 0.5)", lambda v: type(v) in (int, float) and 0 <= v < 0.5)

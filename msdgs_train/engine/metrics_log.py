@@ -95,6 +95,17 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     return lines
 
 
+def best_evaluations(lines: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """By split, the line of the highest PSNR: "best test iteration", as published tables have it, where the split that
+    is reported also chose the step."""
+    best: dict[str, dict[str, Any]] = {}
+    for line in (line for line in lines if line["kind"] == "eval"):
+        split, rest = line["split"], {name: v for name, v in line.items() if name not in ("kind", "split")}
+        if split not in best or rest["psnr"] > best[split]["psnr"]:
+            best[split] = rest
+    return best
+
+
 def draw_curve(run: Path) -> None:
     """Plot loss, PSNR on training and held-out images, and the number of Gaussians against steps, into `curve.png`."""
     lines = read_metrics(run)

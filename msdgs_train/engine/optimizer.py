@@ -11,7 +11,7 @@ from msdgs_train.layers.parameters import ParamGroup
 def make_optimizer(groups: Sequence[ParamGroup], schedule: Schedule) -> torch.optim.Adam:
     """One Adam with the same groups."""
     settings = schedule.config.optimizer
-    params = [{"params": g.params, "lr": _rate(g, schedule, 0), "name": g.name} for g in groups]
+    params = [{"params": g.params, "lr": schedule.rate(g.lr, 0), "name": g.name} for g in groups]
     # fused: 1.1 ms a step for 10,000 Gaussians and two layers, 5.9 ms otherwise
     return torch.optim.Adam(params, betas=(0.9, settings.adam_beta2), eps=settings.adam_eps, fused=True)
 
@@ -28,10 +28,6 @@ def set_learning_rates(
     optimizer: torch.optim.Optimizer, groups: Sequence[ParamGroup], schedule: Schedule, step: int, factor: float
 ) -> None:
     """Set the rates of one step, counted from 0, times `factor`."""
-    rates = {group.name: _rate(group, schedule, step) for group in groups}
+    rates = {group.name: schedule.rate(group.lr, step) for group in groups}
     for group in optimizer.param_groups:
         group["lr"] = factor * rates[group["name"]]
-
-
-def _rate(group: ParamGroup, schedule: Schedule, step: int) -> float:
-    return group.lr.at(step, schedule.num_steps, schedule.full_window_step)

@@ -15,7 +15,13 @@ from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.datasets.identity import identity
 from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.config import TrainConfig, check_resumable
-from msdgs_train.engine.metrics_log import MetricsLog, draw_curve, write_side_by_side
+from msdgs_train.engine.metrics_log import (
+    MetricsLog,
+    best_evaluations,
+    draw_curve,
+    read_metrics,
+    write_side_by_side,
+)
 from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.run_record import (
     BEST,
@@ -292,6 +298,7 @@ class Run:
             "seconds": round(self._seconds(), 1),
             "gaussians": self.trainer.system.size,
             "splits": {split: metrics._asdict() for split, metrics in splits.items()},
+            "best_evaluations": best_evaluations(read_metrics(self.folder)),
             "best": self.record.best and {"file": BEST, **asdict(self.record.best)},
         }
         write_text(self.folder / FINAL_METRICS, json.dumps(metrics, indent=2) + "\n")

@@ -5,6 +5,7 @@ from typing import NamedTuple
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum_config import HALVED_WIDTH
+from msdgs_train.layers.parameters import LearningRate
 
 WINDOW_GROWTH = 0.95
 """Fraction of the growing phase after which the window has all times: the first and the last of them are its newest for
@@ -26,11 +27,12 @@ class Schedule(NamedTuple):
     num_steps: int
     static_steps: int  # all images, no deformation
     deform_start_step: int
+    restart_step: int  # Adam, its rates and density control count from here; 0: from the start
     full_window_step: int  # all times take part alike
     full_resolution_step: int  # wide images have their full size
-    refine_start: int  # the first step of density control, counted from 1
+    refine_start: int  # the first step of density control, counted from 1 in its stage
     refine_every: int  # 0: no density control
-    refine_stop: int  # the last step of density control, counted from 1; 0 without it
+    refine_stop: int  # the last step of density control, counted from 1 in its stage; 0 without it
     reset_every: int  # 0: opacities are never reset
     sh_degree_interval: int
     ema_steps: int  # 0: no average
@@ -42,11 +44,13 @@ class Schedule(NamedTuple):
         static_window = c.static_window_fraction if c.window_full_fraction else 0.0
         refine_stop = config.density.refine_stop_fraction if config.density.refine_every_fraction else 0.0
         static_steps = round(c.static_fraction * steps)
+        deform_start_step = round((c.static_fraction + static_window) * steps)
         return cls(
             config,
             steps,
             static_steps,
-            deform_start_step=round((c.static_fraction + static_window) * steps),
+            deform_start_step=deform_start_step,
+            restart_step=deform_start_step if c.restart_at_motion else 0,
             full_window_step=round(c.window_full_fraction * steps),
             full_resolution_step=round(c.half_resolution_fraction * steps),
             refine_start=round(config.density.refine_start_fraction * steps),
@@ -71,6 +75,21 @@ class Schedule(NamedTuple):
                 Phase("all times", grown, self.num_steps),
             ]
         return [phase for phase in found if phase.stop > phase.first]
+
+    def in_stage(self, step: int) -> int:
+        """A step counted from 1, as counted since Adam and density control have started again."""
+        return step - self.restart_step if step > self.restart_step else step
+
+    def rate(self, lr: LearningRate, step: int) -> float:
+        """A learning rate in this step."""
+        full = max(self.full_window_step - self.restart_step, 0)
+        return lr.at(self.in_stage(step + 1) - 1, self.num_steps - self.restart_step, full)
+
+    def time_noise(self, step: int) -> float:
+        """Standard deviation of the noise on times of images, in distances between them."""
+        c = self.config.curriculum
+        stop = c.time_noise_fraction * self.num_steps
+        return c.time_noise * (1 - step / stop) if self.deforms(step) and step < stop else 0.0
 
     def is_windowed(self, step: int) -> bool:
         """Whether only a part of all times takes part in this step, or its newest images more often than others."""
@@ -106,22 +125,26 @@ class Schedule(NamedTuple):
 
     def refines_at(self, step: int) -> bool:
         """Whether a round of density control is due after this step, counted from 1."""
-        every = self.refine_every
+        every, step = self.refine_every, self.in_stage(step)
         return every > 0 and self.refine_start <= step <= self.refine_stop and step % every == 0
 
     def prunes_hidden(self, step: int, *, several_per_time: bool) -> bool:
         """Whether `gradient` regularizes in this step: until density control ends, but in a time window only if it has
         several images of each time. With one, fast objects would fade."""
-        return step < self.refine_stop and (several_per_time or not self.is_windowed(step))
+        return self.in_stage(step + 1) <= self.refine_stop and (several_per_time or not self.is_windowed(step))
 
     def resets_at(self, step: int) -> bool:
         """Whether opacities are reset after this step, counted from 1."""
-        every = self.reset_every
+        every, step = self.reset_every, self.in_stage(step)
         return every > 0 and step < self.refine_stop and step % every == 0
+
+    def has_reset(self, step: int) -> bool:
+        """Whether opacities have been reset before this step, counted from 1."""
+        return 0 < self.reset_every < self.in_stage(step)
 
     def averages_at(self, step: int) -> bool:
         """Whether the model after this step, counted from 1, is part of the average."""
-        last = max(self.deform_start_step, self.full_window_step, self.refine_stop)
+        last = max(self.deform_start_step, self.full_window_step, self.restart_step + self.refine_stop)
         return self.ema_steps > 0 and step > last
 
 

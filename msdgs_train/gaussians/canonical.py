@@ -112,8 +112,10 @@ class CanonicalGaussians(nn.Module):
         seed: int,
         attributes: Mapping[str, Attribute] = NO_ATTRIBUTES,
         in_view: Callable[[np.ndarray], np.ndarray] | None = None,
+        gray: float | None = None,
     ) -> Self:
-        """`count` Gaussians of random colors, uniform in the cube [-scene_half_size, scene_half_size]³.
+        """`count` Gaussians of random colors, or of one `gray` in [0, 1], uniform in the cube of this half size around
+        the origin.
 
         With `in_view`, [N, 3] → [N] bool, only where it is true, unless it hardly ever is.
         """
@@ -123,7 +125,7 @@ class CanonicalGaussians(nn.Module):
         if in_view is not None:
             found = points[torch.from_numpy(in_view(points.numpy()))]
             points = (found if len(found) >= count else points)[:count]
-        colors = torch.rand(count, 3, generator=generator)
+        colors = torch.rand(count, 3, generator=generator) if gray is None else torch.full((count, 3), gray)
         return cls.from_points(points, colors, sh_degree, generator, attributes)
 
     @classmethod

@@ -5,10 +5,12 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any, get_args
 
+from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.attribute import Attribute
 from msdgs_train.gaussians.modulation import EMBEDDINGS, ModulationTarget, embeddings_attribute
+from msdgs_train.gaussians.raw_quaternions import QuatSpace
 from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.layers.base import Heads, LayerConfig
 from msdgs_train.layers.mlp import MLPConfig
@@ -42,6 +44,9 @@ class ModelConfig:
     """Learning rate of the modulation at the last step, to which it decays exponentially."""
     scale_space: ScaleSpace = "log"
     """`log`: deltas are added to logarithms of scales; `linear`: to the scales, as in DeformGS."""
+    quat_space: QuatSpace = "unit"
+    """`unit`: quaternions are scaled to unit length after their deltas; `raw`: they aren't, as in DeformGS, and shear
+    their Gaussians."""
     opacity_head: bool = False
     """Layers also change opacities, before the sigmoid. Only plans that run layers can hold such a model."""
     sh_head: bool = False
@@ -49,6 +54,10 @@ class ModelConfig:
     eps2d: float = 0.3
     """Dilation of projected covariances, px²; 0.3 in 3D Gaussian Splatting. A smaller one sharpens small structures;
     other renderers, which add 0.3, then draw the model blurrier."""
+    near_plane: float = GSPLAT.near_plane
+    """Gaussians nearer to a camera aren't drawn, scene units; 0.2 in INRIA's rasterizer."""
+    alpha_max: float = GSPLAT.alpha_max
+    """Largest alpha of a Gaussian in a pixel; 0.99 in INRIA's rasterizer. On CUDA gsplat's, 0.999, is fixed."""
 
     def __post_init__(self) -> None:
         for name in ("layers", "modulation_targets"):
@@ -82,6 +91,14 @@ class ModelConfig:
             if self.support.extra_heads and not layer.has_extra_heads:
                 heads = f"{', '.join(self.support.extra_heads)} for --support {self.support.kind}"
                 raise InvalidInput(f"model.layers.{index}", f"of a kind that predicts {heads}", layer.kind)
+        for name, most in (("near_plane", math.inf), ("alpha_max", 1.0)):
+            value = getattr(self, name)
+            if type(value) not in (int, float) or not 0 < value < most:
+                raise InvalidInput(f"model.{name}", f"in (0, {most:g})", value)
+        if self.quat_space not in get_args(QuatSpace):
+            raise InvalidInput("model.quat_space", f"one of {list(get_args(QuatSpace))}", self.quat_space)
+        if self.quat_space == "raw" and self.support.moves_nodes:
+            raise InvalidInput("model.quat_space", "unit with nodes, which rotate Gaussians", self.quat_space)
         if self.scale_space not in get_args(ScaleSpace):
             raise InvalidInput("model.scale_space", f"one of {list(get_args(ScaleSpace))}", self.scale_space)
         if self.layers and self.scale_space not in self.support.scale_spaces:

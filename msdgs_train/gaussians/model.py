@@ -11,6 +11,7 @@ from msdgs_serve.scene.spherical_harmonics import sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians, GaussianRows
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.modulation import EMBEDDINGS, Modulation
+from msdgs_train.gaussians.raw_quaternions import unit_form
 from msdgs_train.gaussians.scale_space import activated_scales, add_to_scales
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.chain import MultiStepDeformation
@@ -23,7 +24,7 @@ class PosedGaussians(NamedTuple):
     """N activated Gaussians at one time, as a rasterizer takes them."""
 
     means: Tensor  # [N, 3] scene units
-    quats: Tensor  # [N, 4] wxyz, unit
+    quats: Tensor  # [N, 4] wxyz, unit; in training with `quat_space` raw of any length, as `rasterize` draws it
     scales: Tensor  # [N, 3] standard deviations, scene units
     opacities: Tensor  # [N] in (0, 1)
     sh: Tensor  # [N, (degree + 1)², 3]
@@ -46,7 +47,8 @@ class DynamicGaussians(nn.Module):
     @property
     def rasterizer(self) -> RasterizerOptions:
         """Constants of the rasterizer for this model."""
-        return GSPLAT._replace(eps2d=self.config.eps2d)
+        c = self.config
+        return GSPLAT._replace(eps2d=c.eps2d, near_plane=c.near_plane, alpha_max=c.alpha_max)
 
     def pose(
         self,
@@ -82,13 +84,13 @@ class DynamicGaussians(nn.Module):
             raw_opacities = raw_opacities + deltas.opacities
         if deltas.sh is not None:
             sh = sh + deltas.sh[:, : sh.shape[1]]
-        return PosedGaussians(
-            means + deltas.means,
-            unit_or_identity(quats + deltas.quats),
-            add_to_scales(self.config.scale_space, g.log_scales, deltas.scales),
-            raw_opacities.sigmoid(),
-            sh,
-        )
+        quats = quats + deltas.quats
+        scales = add_to_scales(self.config.scale_space, g.log_scales, deltas.scales)
+        if self.config.quat_space == "unit":
+            quats = unit_or_identity(quats)
+        elif not torch.is_grad_enabled():
+            quats, scales = unit_form(quats, scales)
+        return PosedGaussians(means + deltas.means, quats, scales, raw_opacities.sigmoid(), sh)
 
     def motion_groups(self) -> list[ParamGroup]:
         """The parameter groups of layers, support and modulation, and of attributes of modulation and support."""

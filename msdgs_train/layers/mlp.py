@@ -56,6 +56,8 @@ class MLPConfig(LayerConfig):
     """Outputs of the network of time."""
     skip: int = 0
     """Skip connection: the input is concatenated after so many hidden layers, fewer than `depth`; 0: none."""
+    initialization: str = "local"
+    """`local`: zero deltas, and hidden units that are active at some positions and times only; `torch`: its default."""
     lr_init: float = 2e-3
     """Learning rate until all times take part."""
     lr_final: float = 2e-5
@@ -68,6 +70,8 @@ class MLPConfig(LayerConfig):
         for name in ("width", "depth", "xyz_frequencies", "time_frequencies", "time_width", "time_features"):
             check_size(f"{field}.{name}", getattr(self, name))
         check_size(f"{field}.skip", self.skip, least=0)
+        if self.initialization not in ("local", "torch"):
+            raise InvalidInput(f"{field}.initialization", "local or torch", self.initialization)
         if self.skip >= self.depth:
             raise InvalidInput(f"{field}.skip", f"fewer than the {self.depth} hidden layers of `depth`", self.skip)
 
@@ -103,7 +107,8 @@ class MLPLayer(DeformationLayer):
         trunk = [nn.Linear(width + (self.input_features if i == c.skip else 0), width) for i in range(1, c.depth)]
         self.trunk = nn.ModuleList(trunk)  # columns of the one after the skip: as `first`, then hidden units
         self.heads = nn.Linear(width, sum(outputs.sizes))
-        self._initialize(trunk)
+        if c.initialization == "local":
+            self._initialize(trunk)
 
     @torch.no_grad()
     def _initialize(self, trunk: list[nn.Linear]) -> None:

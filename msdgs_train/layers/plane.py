@@ -1,5 +1,6 @@
 """One step of deformation read from six planes of features over space and time (paper, section 3.3, equation 11)."""
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -43,6 +44,8 @@ class PlaneConfig(LayerConfig):
     """Hidden units."""
     multires: tuple[int, ...] = (1,)
     """One grid per factor of `resolution`; their features are concatenated. 4DGS has (1, 2)."""
+    initialization: str = "zero"
+    """`zero`: zero deltas; `xavier`: the weights of all Linears uniform (Glorot), as in 4DGaussians."""
     lr_init: float = 2e-3
     """Learning rate of the networks until all times take part."""
     lr_final: float = 2e-5
@@ -59,6 +62,11 @@ class PlaneConfig(LayerConfig):
     """Weight of the mean squared first difference along space."""
     plane_smoothness_weight: float = 0.0
     """Weight of the mean squared second difference along space, what 4DGS calls plane_tv."""
+    smooths_one_axis: bool = False
+    """That difference is along the second axis of a plane alone, as in the code of 4DGaussians."""
+    tv_weight: float = 0.0
+    """Weight of HexPlane's total variation: twice the mean squared first difference along each axis of all planes,
+    along time four times, summed over the planes."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "multires", tuple(self.multires))
@@ -69,6 +77,8 @@ class PlaneConfig(LayerConfig):
     def check(self, field: str, moves_nodes: bool) -> None:
         for name, least in (("features", 1), ("resolution", 2), ("time_resolution", 2), ("width", 1)):
             check_size(f"{field}.{name}", getattr(self, name), least)
+        if self.initialization not in ("zero", "xavier"):
+            raise InvalidInput(f"{field}.initialization", "zero or xavier", self.initialization)
         if not self.multires:
             raise InvalidInput(f"{field}.multires", "one grid or more", self.multires)
         for factor in self.multires:
@@ -141,9 +151,16 @@ class PlaneGrid(nn.Module):
         """Mean squared first difference along space, the sum of both axes of a plane."""
         return self.space.diff(dim=1).square().mean() + self.space.diff(dim=2).square().mean()
 
-    def plane_smoothness(self) -> Tensor:
-        """Mean squared second difference along space, the sum of both axes of a plane; 0 for two nodes a side."""
-        return _mean_square(self.space.diff(n=2, dim=1)) + _mean_square(self.space.diff(n=2, dim=2))
+    def plane_smoothness(self, one_axis: bool = False) -> Tensor:
+        """Mean squared second difference along space, the sum of both axes of a plane, or the second alone; 0 for two
+        nodes a side."""
+        second = _mean_square(self.space.diff(n=2, dim=2))
+        return second if one_axis else _mean_square(self.space.diff(n=2, dim=1)) + second
+
+    def total_variation(self) -> Tensor:
+        """HexPlane's, with both axes of all planes, of which time counts twice; a sum over the planes."""
+        space = _mean_square(self.time.diff(dim=2)) + 2 * _mean_square(self.time.diff(dim=1)) + self.plane_tv()
+        return 2 * len(self.space) * space
 
 
 def _mean_square(differences: Tensor) -> Tensor:
@@ -172,12 +189,19 @@ class PlaneLayer(DeformationLayer):
         self.features = nn.Linear(c.features * len(c.multires), width)
         self.hidden = nn.ModuleList(nn.Linear(width, width) for _ in sizes)
         self.heads = nn.ModuleList(nn.Linear(width, size) for size in sizes)
-        with torch.no_grad():
-            for i, head in enumerate(self.heads):
-                head.get_parameter("bias").zero_()
-                # zero deltas at first; the step weight keeps random parameters
-                if not (outputs.weight and i == len(sizes) - 1):
-                    head.get_parameter("weight").zero_()
+        if c.initialization == "xavier":
+            for linear in (module for module in self.modules() if isinstance(module, nn.Linear)):
+                nn.init.xavier_uniform_(linear.weight)
+        else:
+            self._zero_deltas()
+
+    @torch.no_grad()
+    def _zero_deltas(self) -> None:
+        for i, head in enumerate(self.heads):
+            head.get_parameter("bias").zero_()
+            # the step weight, the last head, keeps random parameters
+            if not (self.outputs.weight and i == len(self.heads) - 1):
+                head.get_parameter("weight").zero_()
 
     def plane_grids(self) -> list[PlaneGrid]:
         """Grids from the coarsest to the finest, as in `multires`."""
@@ -203,11 +227,13 @@ class PlaneLayer(DeformationLayer):
     def regularizers(self, points: Tensor, t: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         c, terms = self.config, {}
         for i, grid in enumerate(self.plane_grids()):
+            smoothness = functools.partial(grid.plane_smoothness, c.smooths_one_axis)
             for weight, name, term in (
                 (c.time_smoothness_weight, "time_smoothness", grid.time_smoothness),
                 (c.l1_time_planes_weight, "l1_time_planes", grid.l1_time_planes),
                 (c.plane_tv_weight, "plane_tv", grid.plane_tv),
-                (c.plane_smoothness_weight, "plane_smoothness", grid.plane_smoothness),
+                (c.plane_smoothness_weight, "plane_smoothness", smoothness),
+                (c.tv_weight, "tv", grid.total_variation),
             ):
                 if weight:
                     terms[f"{name}_{i}"] = weight * term()

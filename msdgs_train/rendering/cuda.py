@@ -6,6 +6,7 @@ from torch import Tensor
 
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_train.layers.quaternions import rotation_matrices
 from msdgs_train.rendering.info import RasterizationInfo
 
 
@@ -16,11 +17,16 @@ def rasterize_cuda(
     options: RasterizerOptions,
     info: RasterizationInfo,
     absolute_gradients: bool,
+    raw_quats: bool,
 ) -> tuple[Tensor, Tensor]:
     """Return rgb [H, W, 3] and alpha [H, W]; arguments as in `rasterize`, float32 on one device."""
-    if options._replace(near_plane=GSPLAT.near_plane, eps2d=GSPLAT.eps2d) != GSPLAT:
-        raise InvalidInput("options", "gsplat's alpha and transmittance limits on CUDA", options)
+    if options._replace(near_plane=GSPLAT.near_plane, eps2d=GSPLAT.eps2d, alpha_max=GSPLAT.alpha_max) != GSPLAT:
+        raise InvalidInput("options", "gsplat's least alpha and transmittance on CUDA", options)
     means, quats, scales, opacities, sh = gaussians
+    covariances = None
+    if raw_quats:  # gsplat would scale them to unit length
+        axes = rotation_matrices(quats) * scales[:, None]
+        covariances = axes @ axes.transpose(1, 2)
     intrinsics = torch.tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], dtype=torch.float32)
     rgb, alpha, meta = gsplat.rasterization(
         means,
@@ -37,6 +43,7 @@ def rasterize_cuda(
         sh_degree=round(sh.shape[1] ** 0.5) - 1,
         packed=False,
         absgrad=absolute_gradients,
+        covars=covariances,
         backgrounds=background[None],
     )
     info.radii = meta["radii"][0].amax(dim=-1).to(means.dtype)

@@ -44,12 +44,13 @@ def rasterize(
     options: RasterizerOptions = GSPLAT,
     *,
     absolute_gradients: bool = False,
+    raw_quats: bool = False,
 ) -> tuple[Tensor, Tensor, RasterizationInfo]:
     """Draw N activated Gaussians; differentiable in every tensor.
 
     Args:
         means: [N, 3] world space.
-        quats: [N, 4] wxyz, unit.
+        quats: [N, 4] wxyz, unit, unless `raw_quats`.
         scales: [N, 3] standard deviations, scene units.
         opacities: [N] in (0, 1).
         sh: [N, (degree + 1)², 3].
@@ -65,7 +66,7 @@ def rasterize(
     if means.is_cuda:
         from msdgs_train.rendering.cuda import rasterize_cuda
 
-        rgb, alpha = rasterize_cuda(gaussians, camera, background, options, info, absolute_gradients)
+        rgb, alpha = rasterize_cuda(gaussians, camera, background, options, info, absolute_gradients, raw_quats)
     else:
         rgb, alpha = _Rasterize.apply(camera, options, info, absolute_gradients, background, *gaussians)
     return rgb, alpha, info

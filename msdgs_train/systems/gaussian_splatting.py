@@ -8,14 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
-from msdgs_serve.scene import Camera
+from msdgs_serve.rasterizer import RasterizerOptions
+from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.density.gradient import GradientStrategy
 from msdgs_train.density.mcmc import MCMCStrategy
 from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.averaging import WeightAverage
+from msdgs_train.engine.optimizer import restart
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
 from msdgs_train.gaussians.bounds import first_by_pose, scene_bounds, scene_scale, spread_frames, views_of
@@ -62,6 +63,8 @@ class GaussianSplatting:
         self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
         self.poses = None
         if config.poses.pose_opt:
+            if config.model.quat_space == "raw":
+                raise InvalidInput("config.pose_opt", "off with --quat-space raw, which no camera can turn", True)
             self.poses = PoseRefinement(config.poses, scene.splits["train"]).to(config.run.device)
 
     @property
@@ -93,22 +96,27 @@ class GaussianSplatting:
             self.poses.center()
         if schedule.deform_start_step in steps:
             self.model.support.on_deform_start(self.model.gaussians, surgery)
+            if schedule.restart_step:
+                restart(optimizer, self.parameter_groups())
         before, after = schedule.window(steps.start - 1), schedule.window(steps.stop - 1)
         if before < after:
             for layer in self.model.deformation:
                 layer.on_window(before, after)
 
     def loss(self, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
-        step, c = moment.step, self.config.loss
+        step, c, t = moment.step, self.config.loss, self._time(frame.t, moment)
         points = canonical_points(self.model.gaussians.rows())
-        motions = self._motions(points, frame.t, step)
-        posed = self._pose(self.model, frame.t, step, motions, points)
+        motions = self._motions(points, t, step)
+        posed = self._pose(self.model, t, step, motions, points)
         seen = self.poses.seen(posed, frame.camera) if self.poses and step >= self.schedule.static_steps else posed
-        absolute = self.config.density.absolute_gradients
         options = self._options(step + 1)
-        rgb, alpha, info = rasterize(*seen, frame.camera, background, options, absolute_gradients=absolute)
+        how = {
+            "absolute_gradients": self.config.density.absolute_gradients,
+            "raw_quats": self.config.model.quat_space == "raw",
+        }
+        rgb, alpha, info = rasterize(*seen, frame.camera, background, options, **how)
         loss = photometric_loss(rgb, target.rgb, 1 - c.ssim_lambda, c.mse_fraction, target.mask)
-        loss = loss + self._regularizers(posed, motions, points, frame.t, moment)
+        loss = loss + self._regularizers(posed, motions, points, t, moment)
         if c.alpha_weight:
             loss = loss + c.alpha_weight * target.alpha_error(alpha)
         clamped = count_clamped(self.config.model.scale_space, posed.scales)
@@ -177,7 +185,17 @@ class GaussianSplatting:
 
     def _options(self, step: int) -> RasterizerOptions:
         """Options of the rasterizer in a step, counted from 1."""
-        return GSPLAT._replace(eps2d=self.schedule.eps2d(step))
+        return self.model.rasterizer._replace(eps2d=self.schedule.eps2d(step))
+
+    def _time(self, t: float, moment: Moment) -> float:
+        """The time of an image, with noise while there is some. Deformable-3D-Gaussians' distance between images is 1
+        over those left in the pass, whose number is as good as uniform."""
+        size = self.schedule.time_noise(moment.step)
+        if not size:
+            return t
+        first, last = self.scene.time_range
+        left = torch.randint(1, len(self.scene.splits["train"]) + 1, (), generator=moment.generator)
+        return t + float(torch.randn((), generator=moment.generator) / left) * size * (last - first)
 
     def _pose(
         self,
@@ -222,7 +240,9 @@ def _new_model(
     else:
         least = schedule.config.density.init_min_views * len(cameras)
         in_view = (lambda points: views_of(points, cameras) >= least) if least else None
-        gaussians = CanonicalGaussians.random_in_cube(count, bounds.scene_half_size, *rest, in_view)
+        gaussians = CanonicalGaussians.random_in_cube(
+            count, bounds.scene_half_size, *rest, in_view, schedule.config.density.init_gray
+        )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         return DynamicGaussians(config, gaussians, bounds)

@@ -105,7 +105,9 @@ def test_each_preset_trains(name: str, data: Path) -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("steps", 0), ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
+        ("steps", 0),
+        ("init_gray", 1.5), ("time_noise", -1.0), ("time_noise_fraction", 2.0),
+        ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
         ("adam_beta2", 1.0), ("adam_eps", 0.0), ("gradient_clip", 0.0), ("means_lr_until_fraction", 0.0),
         ("mse_fraction", 1.1), ("alpha_weight", -1.0), ("prune_unseen_passes", -1.0),
         ("init_min_views", 1.1), ("ema_fraction", -0.1),

@@ -162,7 +162,11 @@ def test_a_run_learns_and_leaves_everything(data: Path, tmp_path: Path) -> None:
     first, *_, last = [line for line in read_metrics(run) if line["kind"] == "eval" and line["split"] == "test"]
     assert last["psnr"] > first["psnr"] > 12
     assert outcome.metrics["test"].psnr == last["psnr"]
-    assert json.loads((run / "metrics.json").read_text())["splits"]["test"]["psnr"] == last["psnr"]
+    final = json.loads((run / "metrics.json").read_text())
+    assert final["splits"]["test"]["psnr"] == last["psnr"]
+    evaluations = [line for line in read_metrics(run) if line["kind"] == "eval" and line["split"] == "test"]
+    assert final["best_evaluations"]["test"]["psnr"] == max(line["psnr"] for line in evaluations)
+    assert final["best_evaluations"].keys() == {"test", "val"}
     assert TrainConfig.from_dict(json.loads((run / "config.json").read_text())).run.steps == 150
     loaded = load_model(run / "model.pt")
     assert loaded.step == 150
