@@ -1,5 +1,6 @@
 """The folder that `msdgs-convert --site` writes: its files, its page, and what is refused."""
 
+import errno
 import gzip
 import json
 import os
@@ -69,7 +70,7 @@ def page_of(site: Path) -> Page:
 
 
 def test_it_holds_all_that_the_page_needs_and_the_licenses(site: Path, scene: Path):
-    assert not list(site.parent.glob(".msdgs-*"))
+    assert not list(site.glob(".msdgs-*"))
     description = json.loads((site / "scene.json").read_text())
     files = {path.relative_to(site).as_posix() for path in site.rglob("*") if path.is_file()}
     assert set(description["files"]) == files
@@ -144,6 +145,16 @@ def test_names_of_files_are_text(tmp_path: Path, scene: Path, runtime: Path):
         named.write_bytes(scene.read_bytes())
         page = page_of(write_site(named, tmp_path / "site", runtime))
         assert page.texts["title"] == named.stem.encode("utf-8", "replace").decode()
+
+
+def test_it_offers_and_explains_only_what_browsers_draw(site: Path):
+    offered = [attributes["value"] for _, attributes in page_of(site).elements if attributes.get("name") == "view"]
+    (drawn,) = re.findall(r"CHANNELS = (\[.*\]);", (site / "viewer" / "local" / "graphics.js").read_text())
+    assert offered == ["rgb", "depth"]
+    assert set(offered) <= set(json.loads(drawn))
+    text = (site / "index.html").read_text()
+    assert re.findall(r"<kbd>(\d)</kbd>", text) == ["1", "2"]
+    assert "motion" not in text.lower()
 
 
 def test_without_scripts_it_says_that_it_needs_them(site: Path):
@@ -223,21 +234,35 @@ def test_it_replaces_a_site_and_nothing_else(tmp_path: Path, scene: Path, runtim
     other = tmp_path / "other"
     other.mkdir()
     (other / "scene.json").write_text("[]")
-    with pytest.raises(InvalidInput, match="holds other files"):
+    with pytest.raises(InvalidInput, match=r"holds scene\.json"):
         write_site(scene, other, runtime)
     (tmp_path / "file").write_text("text")
     with pytest.raises(InvalidInput, match="a folder"):
         write_site(scene, tmp_path / "file", runtime)
 
 
-def test_folders_that_cannot_be_replaced_are_refused(
-    tmp_path: Path, scene: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.chdir(tmp_path)
-    for out in (Path(), tmp_path, Path("/")):
-        with pytest.raises(InvalidInput, match="replaced as a whole"):
-            write_site(scene, out, runtime)
-    assert set(tmp_path.iterdir()) == {runtime}
+def test_the_folder_itself_stays(scene: Path, runtime: Path, site: Path, monkeypatch: pytest.MonkeyPatch):
+    replace = os.replace
+
+    def mounted(source: Path, target: Path) -> None:
+        if site in (source, target):
+            raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), str(source))
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", mounted)
+    (site / "lost+found").mkdir()
+    (site / ".msdgs-killed").mkdir()
+    (site / ".msdgs-killed" / "index.html").write_text("")
+    (site / "viewer" / "old.js").write_text("")
+    description = json.loads((site / "scene.json").read_text())
+    (site / "scene.json").write_text(json.dumps(description | {"files": [*description["files"], "viewer/old.js"]}))
+    monkeypatch.chdir(site)
+    told = StringIO()
+    write_site(scene, Path(), runtime, Console(file=told, soft_wrap=True), title="Again")
+    assert f'src="{site.name}/"' in told.getvalue()
+    assert page_of(site).texts["title"] == "Again"
+    assert not (site / "viewer" / "old.js").exists()
+    assert (site / "lost+found").is_dir()
 
 
 def test_an_interrupted_one_leaves_the_old_one(scene: Path, runtime: Path, site: Path, monkeypatch: pytest.MonkeyPatch):
@@ -253,18 +278,26 @@ def test_an_interrupted_one_leaves_the_old_one(scene: Path, runtime: Path, site:
         patch.setattr(Path, "write_bytes", failing)
         with pytest.raises(WriteFailed, match="the disk is full"):
             write_site(scene, site, runtime, title="New")
+        with pytest.raises(WriteFailed, match="the disk is full"):
+            write_site(scene, site.parent / "new", runtime)
     assert page_of(site).texts["title"] == old
-    assert not list(site.parent.glob(".msdgs-*"))
+    assert not list(site.glob(".msdgs-*"))
+    assert not (site.parent / "new").exists()
 
 
+def contents_of(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize("count", [1, 4, 7, 10, 13])
 def test_one_that_cannot_take_its_place_leaves_the_old_one(
-    scene: Path, runtime: Path, site: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Path, runtime: Path, site: Path, monkeypatch: pytest.MonkeyPatch, count: int
 ):
-    replace, moved = os.replace, []
+    before, replace, moved = contents_of(site), os.replace, []
 
     def failing(source: Path, target: Path) -> None:
         moved.append(source)
-        if len(moved) == 2:
+        if len(moved) == count:
             raise KeyboardInterrupt
         replace(source, target)
 
@@ -272,7 +305,7 @@ def test_one_that_cannot_take_its_place_leaves_the_old_one(
         patch.setattr(os, "replace", failing)
         with pytest.raises(KeyboardInterrupt):
             write_site(scene, site, runtime, title="New")
-    assert page_of(site).texts["title"] == "balls"
+    assert contents_of(site) == before
 
 
 def test_it_tells_the_address_of_folders_whose_names_are_no_text(tmp_path: Path, scene: Path, runtime: Path):

@@ -4,6 +4,7 @@ import gzip
 import json
 import os
 import shlex
+from contextlib import suppress
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from msdgs_serve.imaging import encode
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_serve.writing import temporary_folder
+from msdgs_serve.writing import PREFIX, temporary_folder
 
 FORMAT = "msdgs-site/1"
 DESCRIPTION = "scene.json"
@@ -43,24 +44,40 @@ def write_site(session: DeformationSession, options: ConvertOptions, console: Co
     if options.t is not None:
         raise InvalidInput("t", "left out for a site, which shows all times", options.t)
     text = _text(session, options)
-    _check_replaceable(out)
+    replaced = _replaceable(out)
     files = _files(session, options, text, site_runtime(options.onnxruntime_web, console))
-    parent = out.absolute().parent
-    parent.mkdir(parents=True, exist_ok=True)
-    with temporary_folder(parent, out) as folder:
+    is_new = not out.exists()
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        _replace(out, replaced, files)
+    except BaseException:
+        if is_new:
+            with suppress(OSError):
+                out.rmdir()
+        raise
+    _tell(out, text, files, console)
+
+
+def _replace(out: Path, replaced: set[str], files: dict[str, bytes]) -> None:
+    """Write files into a folder in the place of the entries named `replaced`: all, or none.
+
+    The folder itself stays, as others may hold on to it: a mount point, a container, a server.
+    """
+    with temporary_folder(out, out) as folder:
         new, old = folder / "new", folder / "old"
+        old.mkdir()
         for path, contents in files.items():
             (new / path).parent.mkdir(parents=True, exist_ok=True)
             (new / path).write_bytes(contents)
-        if out.is_dir():
-            os.replace(out, old)
+        moves = [(out / name, old / name) for name in replaced] + [(path, out / path.name) for path in new.iterdir()]
         try:
-            os.replace(new, out)
+            for source, target in moves:
+                os.replace(source, target)
         except BaseException:
-            if old.is_dir():
-                os.replace(old, out)
+            for source, target in reversed(moves):
+                if not source.exists():
+                    os.replace(target, source)
             raise
-    _tell(out, text, files, console)
 
 
 def _text(session: DeformationSession, options: ConvertOptions) -> PageText:
@@ -76,27 +93,21 @@ def _printable(text: str) -> str:
     return " ".join(text.encode("utf-8", "replace").decode().split())
 
 
-def _check_replaceable(out: Path) -> None:
-    """Raise `InvalidInput` if `out` is a file, or a folder with anything but a site."""
+def _replaceable(out: Path) -> set[str]:
+    """The names in `out` of what a site consists of. Raises `InvalidInput` if it is a file, or holds other files."""
     if out.exists() and not out.is_dir():
         raise InvalidInput("out", "a folder", str(out))
-    if out.is_dir() and (out.is_mount() or out.samefile(Path.cwd())):
-        found = f"{out}, which is the current folder or a mount point"
-        raise InvalidInput("out", "a folder that can be replaced as a whole", found)
-    if not out.is_dir() or not any(out.iterdir()):
-        return
     try:
         written = set(json.loads((out / DESCRIPTION).read_text())["files"])
     except (OSError, ValueError, LookupError, TypeError):
-        raise InvalidInput("out", "a new folder, or one that holds a site", f"{out}, which holds other files") from None
-    others = sorted(
-        path.relative_to(out).as_posix()
-        for path in out.rglob("*")
-        if path.is_file() and path.relative_to(out).as_posix() not in written
-    )
+        written = set()
+    files = [path.relative_to(out) for path in out.rglob("*") if path.is_file()]
+    files = [path for path in files if not path.parts[0].startswith(PREFIX)]
+    others = sorted(path.as_posix() for path in files if path.as_posix() not in written)
     if others:
         found = f"{out}, which also holds {', '.join(others[:3])}"
         raise InvalidInput("out", "a new folder, or one that holds nothing but a site", found)
+    return {path.parts[0] for path in files}
 
 
 def _files(
@@ -151,7 +162,7 @@ def _tell(out: Path, text: PageText, files: dict[str, bytes], console: Console) 
         f"{out}: {len(files)} files, {size / 1e6:.1f} MB, of which the scene has {scene / 1e6:.1f} MB",
         f"to look at it: python -m http.server -d {shlex.quote(str(out))}",
         "then open http://localhost:8000",
-        f"to show it in another page: {iframe(text, out.name)}",
+        f"to show it in another page: {iframe(text, out.absolute().name)}",
     ]
     if scene > 1e6 * WEB_MB:
         lines.append("msdgs-export --for-web writes a scene with fewer bytes")
