@@ -145,3 +145,4 @@ def test_many_gaussians_from_outside_and_inside(opened: Page, scenes: Path, dist
     wanted = Renderer().render(session, camera, 0.0).display_pixels() / 255
     assert wanted.std() > 0.05
     assert psnr(seen(opened, {"camera": plain(camera), "t": 0.0}), wanted) >= tolerance("drawn_here_db")
+    assert [Path(worker.url).name for worker in opened.workers] == ["sort_worker.js"], "nothing is posed any more"

@@ -1,7 +1,9 @@
 """What a site's page says if a file is missing, damaged or another one, or if the browser can't draw."""
 
 import gzip
+import os
 import shutil
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +18,14 @@ from tests.support.sites import NO_WEBGL2, needs_runtime, picture
 pytestmark = [pytest.mark.slow, needs_runtime]
 
 SCENE = "scene.onnx.gz"
+
+LOSE = """() => {
+    const graphics = document.querySelector("#image + canvas").getContext("webgl2");
+    window.context = graphics.getExtension("WEBGL_lose_context");
+    context.loseContext();
+}"""
+"""Takes the graphics from a page; `context.restoreContext()` gives them back."""
+LOST = "The browser has taken the graphics from this page."
 
 
 def missing(site: Path) -> None:
@@ -54,6 +64,15 @@ def no_runtime(site: Path) -> None:
     shutil.rmtree(site / "onnxruntime-web")
 
 
+def half_a_runtime(site: Path) -> None:
+    binary = site / "onnxruntime-web" / "ort-wasm.wasm.gz"
+    binary.write_bytes(binary.read_bytes()[:1000])
+
+
+def another_runtime(site: Path) -> None:
+    (site / "onnxruntime-web" / "ort-wasm.wasm.gz").write_bytes(b"<!doctype html>")
+
+
 def no_module(site: Path) -> None:
     (site / "viewer" / "camera.js").unlink()
 
@@ -85,6 +104,8 @@ def half_a_description(site: Path) -> None:
         (another_scene, f"The scene’s file {SCENE} isn’t the one that this page was written for"),
         (same_size, f"The scene’s file {SCENE} isn’t the one that this page was written for"),
         (no_runtime, "onnxruntime-web can’t be loaded"),
+        (half_a_runtime, "onnxruntime-web is damaged, or was not copied or sent as a whole."),
+        (another_runtime, "onnxruntime-web can’t be used: ort-wasm.wasm.gz isn’t WebAssembly."),
         (no_module, "A file of this page is missing below viewer/"),
         (no_pose_worker, "can’t be loaded"),
         (no_sort_worker, "can’t be loaded"),
@@ -103,6 +124,30 @@ def test_the_page_says_what_is_wrong_with_the_folder(
     assert page.locator("#preview").is_visible()
 
 
+def test_a_file_that_has_changed_underneath_is_told_as_soon_as_it_is_needed(
+    page: Page, folder: Path, site: Path, server: str, tmp_path: Path
+):
+    changed = folder / tmp_path.name
+    shutil.copytree(site, changed)
+    page.emulate_media(reduced_motion="reduce")
+    page.goto(f"{server}/{changed.name}/")
+    wait_until_still(page)
+    another_scene(changed)
+    later = time.time() + 10  # for caches, which compare seconds
+    os.utime(changed / SCENE, (later, later))
+    page.get_by_role("button", name="Download the file").click()
+    said = f"The scene’s file {SCENE} isn’t the one that this page was written for"
+    expect(page.locator("#banner")).to_contain_text(said)
+    forget(page)
+    page.locator("#image").press("ArrowLeft")
+    wait_until_still(page)
+
+    page.evaluate(LOSE)
+    expect(page.locator("#banner")).to_contain_text(LOST)
+    page.evaluate("context.restoreContext()")
+    expect(page.locator("#banner")).to_contain_text(said)
+
+
 def test_without_webgl2_it_says_so(page: Page, site: Path, server: str):
     page.add_init_script(NO_WEBGL2)
     page.goto(f"{server}/site/")
@@ -114,11 +159,8 @@ def test_it_goes_on_after_a_lost_context(page: Page, site: Path, server: str):
     page.goto(f"{server}/site/#t=0.5")
     wait_until_still(page)
     before = picture(page)
-    page.evaluate("""() => {
-        const graphics = document.querySelector("#image + canvas").getContext("webgl2");
-        window.context = graphics.getExtension("WEBGL_lose_context");
-        context.loseContext(); }""")
-    expect(page.locator("#banner")).to_contain_text("The browser has taken the graphics from this page.")
+    page.evaluate(LOSE)
+    expect(page.locator("#banner")).to_contain_text(LOST)
     forget(page)
     page.evaluate("context.restoreContext()")
     expect(page.locator("#banner")).to_be_hidden()

@@ -3,15 +3,16 @@
 const GZIP = [0x1f, 0x8b];
 
 /**
- * Return the bytes behind an address, or of a Blob or ArrayBuffer.
- * @param {string | Blob | ArrayBuffer} source
+ * Return the bytes behind an address, or of an ArrayBuffer.
+ * @param {string | ArrayBuffer} source
  * @param {string} what  its name in errors
  * @param {(loaded: number, total: number) => void} progress  bytes; `total` is 0 if the server doesn't tell
  * @returns {Promise<Uint8Array>}
  */
 export async function download(source, what, progress) {
-  if (typeof source !== "string") return unpacked(new Uint8Array(await new Response(source).arrayBuffer()), what);
-  const response = await fetch(source).catch(() => {
+  if (typeof source !== "string") return unpacked(new Uint8Array(source), what);
+  // Servers that don't say how long a file stays the same leave that to browsers, whose guess would mix old and new files.
+  const response = await fetch(source, { cache: "no-cache" }).catch(() => {
     throw new Error(`${what} can’t be loaded: the server doesn’t answer.`);
   });
   if (!response.ok) throw new Error(`${what} can’t be loaded: the server answered ${response.status}.`);

@@ -1,5 +1,5 @@
 // Draws a scene file with WebGL2. One worker poses it by onnxruntime-web, another sorts; nothing runs while nothing
-// changes.
+// changes. A scene in which nothing moves is posed once, and its worker ends with all that it holds.
 
 import { CHANNELS, Graphics, contextOf } from "./graphics.js";
 import { inWorld, viewOf } from "./place.js";
@@ -12,11 +12,12 @@ const MISSING = "A part of the page can’t be loaded."; // of a worker whose fi
 const STATIC = { first: { slot: 0 }, second: { slot: 0 }, share: 0, isExact: true };
 
 /**
- * Load a scene, and return an `Engine` that draws it. Rejects with an Error whose message is for people if the scene, the
- * runtime or WebGL2 can't be used.
+ * Load a scene, and return an `Engine` that draws it, until the canvas loses its context. Rejects with an Error whose
+ * message is for people if the scene, the runtime or WebGL2 can't be used.
  * @param {object} options
  * @param {HTMLCanvasElement} options.canvas  one without a context yet
- * @param {string | Blob | ArrayBuffer} options.scene  the scene file, or its address; it may be gzipped
+ * @param {string | ArrayBuffer} options.scene  the address of the scene file, or its contents, which the caller loses; it
+ *   may be gzipped
  * @param {{module: string, glue: string, binary: string}} options.runtime  addresses of onnxruntime-web's files
  *   ort.wasm.min.mjs, ort-wasm-simd-threaded.mjs and ort-wasm-simd-threaded.wasm, the last of which may be gzipped
  * @param {(bytes: {loaded: number, total: number}) => void} [options.onProgress]  `total` is 0 if it is unknown
@@ -29,9 +30,8 @@ export async function openEngine({ canvas, scene, runtime, onProgress = () => {}
   const files = Object.fromEntries(Object.entries(runtime).map(([part, path]) => [part, address(path)]));
   const poser = worker("pose_worker.js");
   try {
-    const facts = await answerOf(poser, { kind: "open", scene: source, runtime: files }, onProgress);
-    const constants = await answerOf(poser, { kind: "constants" });
-    return new Engine(gl, poser, facts, constants.arrays, onError);
+    const opened = await open(poser, { kind: "open", scene: source, runtime: files }, onProgress);
+    return new Engine(gl, poser, opened, onError);
   } catch (error) {
     poser.terminate();
     throw error;
@@ -40,8 +40,8 @@ export async function openEngine({ canvas, scene, runtime, onProgress = () => {}
 
 const worker = (name) => new Worker(new URL(name, import.meta.url), { type: "module" });
 
-/** Send a message to the worker that poses, and return its answer. */
-function answerOf(poser, message, onProgress = () => {}) {
+/** Return what the worker that poses answers when it has opened a scene. */
+function open(poser, message, onProgress) {
   return new Promise((resolve, reject) => {
     poser.onerror = ({ message: text }) => reject(new Error(text || MISSING));
     poser.onmessage = ({ data }) => {
@@ -49,13 +49,12 @@ function answerOf(poser, message, onProgress = () => {}) {
       else if (data.kind === "failed") reject(new Error(data.message));
       else resolve(data);
     };
-    poser.postMessage(message);
+    poser.postMessage(message, typeof message.scene === "string" ? [] : [message.scene]);
   });
 }
 
 class Engine {
-  #canvas;
-  #poser;
+  #poser; // has ended if nothing moves
   #sorter;
   #graphics;
   #poses;
@@ -65,11 +64,9 @@ class Engine {
   #sorting = null; // the view whose order is being computed, as a text
   #spent = null; // a buffer of an earlier order
   #sorted = ""; // the view that the order is for
-  #isReady = true; // whether the graphics have what doesn't depend on time
   #waiting = []; // of `settled`
 
-  constructor(gl, poser, { metadata, moving, changing, steps }, constants, onError) {
-    this.#canvas = gl.canvas;
+  constructor(gl, poser, { metadata, moving, changing, steps, arrays: constants }, onError) {
     this.#poser = poser;
     this.#onError = onError;
     this.metadata = inWorld(metadata);
@@ -80,6 +77,7 @@ class Engine {
     const scene = { metadata: this.metadata, moving, gaussians: this.gaussians, changing };
     this.#graphics = new Graphics(gl, scene);
     this.#graphics.setConstants(constants);
+    if (!moving) poser.terminate();
     this.#sorter = worker("sort_worker.js");
     const interpolates = !metadata.plan.startsWith("frames:"); // whose Gaussians are replaced, not moved
     this.#poses = new Poses({ interpolates, range: metadata.time_range }, (pose) => this.#pose(pose));
@@ -87,8 +85,6 @@ class Engine {
     this.#poser.onerror = ({ message }) => onError(new Error(message || MISSING));
     this.#sorter.onmessage = ({ data }) => this.#takeOrder(data);
     this.#sorter.onerror = ({ message }) => onError(new Error(message || MISSING));
-    this.#canvas.addEventListener("webglcontextlost", this.#lost);
-    this.#canvas.addEventListener("webglcontextrestored", this.#restored);
     const { means } = constants;
     this.#sorter.postMessage({ kind: "constants", means, moving }, [means.buffer]);
   }
@@ -126,8 +122,6 @@ class Engine {
 
   dispose() {
     cancelAnimationFrame(this.#frame);
-    this.#canvas.removeEventListener("webglcontextlost", this.#lost);
-    this.#canvas.removeEventListener("webglcontextrestored", this.#restored);
     this.#poser.terminate();
     this.#sorter.terminate();
     this.#graphics.dispose();
@@ -141,7 +135,7 @@ class Engine {
   }
 
   #advance() {
-    if (!this.#isReady || !this.#wanted || this.#graphics.isLost) return;
+    if (!this.#wanted || this.#graphics.isLost) return;
     const poses = this.#posesShown();
     if (!poses) return;
     const { view } = this.#wanted;
@@ -169,22 +163,14 @@ class Engine {
 
   #takeAnswer(data) {
     if (data.kind === "pose") this.#takePose(data);
-    else if (data.kind === "constants") this.#takeConstants(data);
     else {
       this.#poses.failed();
       this.#onError(new Error(data.message));
     }
   }
 
-  /** What was asked for after a lost context. */
-  #takeConstants({ arrays }) {
-    this.#graphics.setConstants(arrays);
-    this.#isReady = true;
-    this.#schedule();
-  }
-
   #takePose({ t, steps = null, slot, arrays, milliseconds }) {
-    if (!this.#isReady) return; // asked for before the context was lost
+    if (this.#graphics.isLost) return;
     this.stats.poseMs = milliseconds;
     this.#graphics.setPose(slot, arrays);
     this.#sorter.postMessage({ kind: "pose", slot, means: arrays.means }, [arrays.means.buffer]);
@@ -211,15 +197,4 @@ class Engine {
     [this.#sorting, this.#spent] = [null, order.buffer];
     this.#schedule();
   }
-
-  #lost = (event) => {
-    event.preventDefault(); // so that it is restored
-    [this.#isReady, this.#sorted] = [false, ""];
-  };
-
-  #restored = () => {
-    this.#graphics.restore();
-    this.#poses.forget();
-    this.#poser.postMessage({ kind: "constants" });
-  };
 }

@@ -25,16 +25,6 @@ export class Graphics {
     this.gl = gl;
     this.canvas = gl.canvas;
     this.scene = scene;
-    this.restore();
-  }
-
-  get isLost() {
-    return this.gl.isContextLost();
-  }
-
-  /** Make all resources, at first and after a lost context; the arrays have to be set again. */
-  restore() {
-    const { gl, scene } = this;
     const posed = [...MOVING, ...scene.changing];
     this.found = 0; // Gaussians that are drawn
     this.project = program(gl, EVERYWHERE, projectShader({ degree: scene.metadata.sh_degree, posed }));
@@ -49,6 +39,10 @@ export class Graphics {
     const rows = Math.max(Math.ceil(scene.gaussians / (1 << ROW_BITS)), 1);
     this.splats = target(gl, [gl.RGBA32UI, gl.RGBA32UI], 1 << ROW_BITS, rows);
     this.frame = null;
+  }
+
+  get isLost() {
+    return this.gl.isContextLost();
   }
 
   /** Set what doesn't depend on time, arrays by name. */

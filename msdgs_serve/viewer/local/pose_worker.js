@@ -5,6 +5,7 @@ import { readSceneFile } from "./scene_file.js";
 
 const POSED = ["means", "quats", "scales"];
 const APPEARANCE = ["opacities", "sh"];
+const WASM = [0x00, 0x61, 0x73, 0x6d]; // first bytes
 const CHUNK = 2048; // Gaussians per call of a graph that runs layers on Gaussians
 
 class Poser {
@@ -24,6 +25,9 @@ class Poser {
       download(runtime.binary, "onnxruntime-web", tell("runtime")),
       download(scene, "The scene file", tell("scene")),
     ]);
+    if (WASM.some((byte, k) => wasmBinary[k] !== byte)) {
+      throw new Error(`onnxruntime-web can’t be used: ${runtime.binary.split("/").at(-1)} isn’t WebAssembly.`);
+    }
     Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary, wasmPaths: { mjs: runtime.glue } });
     const poser = new Poser(ort, readSceneFile(bytes));
     await poser.#start(bytes);
@@ -45,7 +49,8 @@ class Poser {
     this.session = await this.ort.InferenceSession.create(bytes, options).catch((error) => {
       throw new Error(`onnxruntime can’t open the scene file: ${error.message}`);
     });
-    this.ort.env.wasm.wasmBinary = undefined; // 14 MB, compiled now
+    const { buffer } = this.ort.env.wasm.wasmBinary;
+    structuredClone(buffer, { transfer: [buffer] }); // compiled now: lets go 14 MB that onnxruntime-web keeps
     const rows = Object.fromEntries(this.session.outputMetadata.map(({ name, shape }) => [name, shape[0]]));
     this.moving ??= rows.means;
     this.changing = APPEARANCE.filter((name) => `static_${name}` in rows);
@@ -112,10 +117,7 @@ let poser = null;
 const answers = {
   async open(message) {
     poser = await Poser.open(message);
-    return { kind: "opened", ...poser.facts };
-  },
-  async constants() {
-    return { kind: "constants", arrays: await poser.constants() };
+    return { kind: "opened", ...poser.facts, arrays: await poser.constants() };
   },
   async pose({ t, steps, slot }) {
     const start = performance.now();

@@ -12,11 +12,6 @@ export class Poses {
     Object.assign(this, { interpolates, range, ask });
     this.seconds = 0; // that a pose takes
     this.interval = 0; // seconds between frames of playback
-    this.forget();
-  }
-
-  /** Forget all poses, as after a lost context. */
-  forget() {
     this.kept = []; // { t, steps, slot } by time; the first is shown
     this.isAsking = false;
     this.last = null; // { t, now } of playback

@@ -90,11 +90,12 @@ export class LocalSource {
       if (number !== this.number) return;
       const canvas = this.viewer.stage.addCanvas();
       this.canvas = canvas;
-      canvas.addEventListener("webglcontextlost", () => canvas === this.canvas && say(LOST)); // else `#close` gave it back
-      canvas.addEventListener("webglcontextrestored", () => {
-        say("");
-        this.change();
+      canvas.addEventListener("webglcontextlost", (event) => {
+        if (canvas !== this.canvas) return; // `#close` gave it back
+        event.preventDefault(); // so that it is restored
+        say(LOST);
       });
+      canvas.addEventListener("webglcontextrestored", () => canvas === this.canvas && this.#reload());
       const engine = await openEngine({
         canvas,
         scene: contents,
@@ -115,6 +116,13 @@ export class LocalSource {
         this.progress.hidden = true;
       }
     }
+  }
+
+  /** Open the scene again, all of whose arrays were lost with the graphics. */
+  async #reload() {
+    say("");
+    this.sha256 = null;
+    await this.open(this.viewer.scene).catch((error) => say(error.message));
   }
 
   #close() {

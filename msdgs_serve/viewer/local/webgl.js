@@ -123,6 +123,6 @@ function nearest(gl) {
 
 function checkSize(gl, size) {
   const limit = gl.getParameter(gl.MAX_TEXTURE_SIZE);
-  if (size <= limit) return;
+  if (size <= limit || gl.isContextLost()) return;
   throw new Error(`The scene or its image is too large for this graphics card: ${size} rows of ${limit} at most.`);
 }
