@@ -9,8 +9,9 @@ export class Timeline {
     this.player = player;
     this.host = host;
     const find = (id) => document.getElementById(id);
-    const ids = ["timeline", "play", "time", "time-text", "loop", "speed"];
-    [this.group, this.play, this.slider, this.time, this.loop, this.speed] = ids.map(find);
+    this.parts = document.querySelectorAll(".of-time"); // also of the help
+    const ids = ["play", "time", "time-text", "loop", "speed"];
+    [this.play, this.slider, this.time, this.loop, this.speed] = ids.map(find);
     this.play.addEventListener("click", () => this.toggle());
     this.slider.addEventListener("input", () => {
       player.playing = false;
@@ -27,7 +28,7 @@ export class Timeline {
 
   /** Follow the player to another scene. */
   open() {
-    this.group.hidden = !this.player.changes;
+    for (const part of this.parts) part.hidden = !this.player.changes;
     this.speed.title = `At 1× a run takes ${plain(this.player.seconds)} seconds`;
     this.show();
   }

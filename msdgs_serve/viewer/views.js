@@ -34,7 +34,7 @@ export class Views {
   }
 
   #lack(name) {
-    if (!this.names.includes(name)) return "The link asks for a view that doesn’t exist: this is the color.";
+    if (!this.names.includes(name)) return "The link asks for a view that this page doesn’t have: this is the color.";
     if (!this.drawn.includes(name)) return "Browsers don’t draw this view, only msdgs-serve does: this is the color.";
     if (name !== MOTION || this.moves) return "";
     return "Nothing moves in this scene that could be shown as motion: this is its color.";

@@ -1,10 +1,11 @@
 """Scenes of all kinds in a browser: they open, and look as the service draws them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, expect
 from rich.console import Console
 
 from msdgs_export.bake import bake
@@ -38,6 +39,12 @@ def static(file: Path) -> None:
     file.write_bytes(static_scene(Splats(some_gaussians(500, 3)), "0" * 64).SerializeToString())
 
 
+def large(file: Path) -> None:
+    gaussians = some_gaussians(300_000)
+    gaussians = replace(gaussians, scales=gaussians.scales / 8)
+    file.write_bytes(static_scene(Splats(gaussians), "0" * 64).SerializeToString())
+
+
 def sequence(seeds: tuple[int, ...], *, blended: bool = True) -> Callable[[Path], None]:
     def write(file: Path) -> None:
         frames = tuple(some_gaussians(500, 3, seed) for seed in seeds)
@@ -64,8 +71,8 @@ def run_of_4dgs(file: Path) -> None:
 
 @pytest.mark.parametrize(
     "write",
-    [static, sequence((0, 1, 2)), sequence((0, 1, 2), blended=False), fading, far_away, run_of_4dgs],
-    ids=["static", "sequence", "switched", "fading", "far away", "4dgs"],
+    [static, large, sequence((0, 1, 2)), sequence((0, 1, 2), blended=False), fading, far_away, run_of_4dgs],
+    ids=["static", "300,000", "sequence", "switched", "fading", "far away", "4dgs"],
 )
 def test_it_looks_as_the_service_draws_it(
     browser: Browser, folder: Path, server: str, tmp_path: Path, write: Callable[[Path], None]
@@ -83,6 +90,9 @@ def test_it_looks_as_the_service_draws_it(
         assert page.locator("#timeline").is_visible() == scene.changes
         assert not page.locator("#banner").is_visible()
         got = picture(page)
+        page.keyboard.press("?")
+        expect(page.locator("#help")).to_be_visible()
+        assert page.get_by_text("play, pause").is_visible() == scene.changes
     wanted = drawn_by_the_service(file, t, 40.0, 10.0, (got.shape[1], got.shape[0]))
     assert wanted.std() > 0.01
     assert psnr(got, wanted) >= tolerance("drawn_here_db")

@@ -6,23 +6,27 @@ import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
 from tests.support.pages import watched_page
-from tests.support.processes import forget, wait_until_still
+from tests.support.processes import ROOT, forget, wait_until_still
 from tests.support.sites import drawn_by_the_service, needs_runtime, picture, psnr
 from tests.support.tolerances import tolerance
 
 pytestmark = [pytest.mark.slow, needs_runtime]
 
 COUNT_WORK = """() => {
-    window.work = 0;
+    [window.work, window.times] = [0, []];
     const counted = (holder, name) => {
         const call = holder[name];
-        holder[name] = function (...values) { window.work += 1; return call.apply(this, values); };
+        holder[name] = function (...values) {
+            window.work += 1;
+            if (values[0]?.kind === "pose" && "t" in values[0]) times.push(values[0].t);
+            return call.apply(this, values);
+        };
     };
     counted(window, "requestAnimationFrame");
     counted(Worker.prototype, "postMessage");
     counted(WebGL2RenderingContext.prototype, "drawArrays");
 }"""
-"""Counts what a page does by itself: animation frames, messages to workers and draw calls."""
+"""Counts what a page does by itself: animation frames, messages to workers and draw calls. Lists times of poses."""
 HIDE = """(isHidden) => {
     Object.defineProperty(document, "hidden", { value: isHidden, configurable: true });
     document.dispatchEvent(new Event("visibilitychange"));
@@ -56,7 +60,8 @@ def test_it_plays_from_the_folder_alone(page: Page, site: Path, server: str):
     assert page.evaluate("work") == 0, "it works although nothing changes"
 
     page.keyboard.press("Space")
-    page.wait_for_function("() => work > 10")
+    page.wait_for_function("() => times.length > 3")
+    assert any(240 * t % 1 for t in page.evaluate("times")), "only those of the service"
     page.evaluate(HIDE, True)
     page.wait_for_function("() => new Promise((d) => setTimeout(() => d(work), 300)).then((w) => w === work)")
     before = page.evaluate("work = 0, document.getElementById('time').value")
@@ -104,8 +109,26 @@ def test_opened_as_a_file_it_says_what_to_do(browser: Browser, site: Path):
     with browser.new_context() as context:
         page = context.new_page()
         page.goto((site / "index.html").as_uri())
-        expect(page.locator("#banner")).to_contain_text(f"python -m http.server -d '{site}'")
+        expect(page.locator("#banner")).to_contain_text(f"python -m http.server -d '{site}/'")
         assert page.locator("#preview").evaluate("(image) => image.complete && image.naturalWidth") == 1200
+
+
+@pytest.mark.parametrize(
+    ("host", "path", "folder"),
+    [
+        ("", "/C:/Users/M%20E/it's/index.html", '"C:/Users/M E/it\'s/"'),
+        ("", "/D:/index.html", '"D:/"'),
+        ("server", "/share/toys/index.html", '"//server/share/toys/"'),
+        ("", "/home/me/it's/index.html", "'/home/me/it'\\''s/'"),
+        ("", "/index.html", "'/'"),
+    ],
+)
+def test_the_command_is_one_of_the_system(page: Page, host: str, path: str, folder: str):
+    served = (ROOT / "msdgs_serve" / "viewer" / "site" / "served.js").read_text()
+    page.set_content("<p id='banner' hidden></p><script type='module'></script>")
+    location = {"protocol": "file:", "host": host, "pathname": path}
+    page.evaluate("([source, location]) => new Function('location', source)(location)", [served, location])
+    assert page.locator("code").inner_text() == f"python -m http.server -d {folder}"
 
 
 def test_while_it_loads_it_shows_the_preview_and_counts_bytes(page: Page, site: Path, server: str):

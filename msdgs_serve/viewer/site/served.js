@@ -7,12 +7,18 @@ document.querySelector("script[type=module]").addEventListener("error", () => {
   banner.hidden = false;
 });
 if (location.protocol === "file:") {
-  const folder = decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "");
+  const folder = decodeURIComponent(location.pathname).replace(/[^/]*$/, "");
   const banner = document.getElementById("banner");
   banner.textContent =
     "Browsers show this page only if it comes from a server. This command is one, and the page is at http://localhost:8000 then: ";
   const command = document.createElement("code");
-  command.textContent = `python -m http.server -d '${folder.replaceAll("'", "'\\''")}'`;
+  command.textContent = `python -m http.server -d ${quoted(folder)}`;
   banner.append(command);
   banner.hidden = false;
+}
+
+/** A folder of an address as a word of a command, as its system's shells take it. */
+function quoted(folder) {
+  const onWindows = location.host ? `//${location.host}${folder}` : folder.match(/^\/([a-z]:.*)/i)?.[1];
+  return onWindows ? `"${onWindows}"` : `'${folder.replaceAll("'", "'\\''")}'`;
 }
