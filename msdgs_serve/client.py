@@ -179,6 +179,7 @@ class Client:
         scene: str | None = None,
         width: Whole | None = None,
         height: Whole | None = None,
+        region: Sequence[Whole] | None = None,
         channels: Sequence[Channel] = DEFAULT_CHANNELS,
         background: Background = "auto",
         shutter: Shutter | None = None,
@@ -186,10 +187,11 @@ class Client:
         steps: Real | None = None,
     ) -> Frame:
         """Return a frame as arrays, for a list of times with all of them. The channel `motion` needs `dt`, in scene
-        time; `steps` is the number of the scene's layers that are applied. Raises `ClientError`."""
+        time; `steps` is the number of the scene's layers that are applied; `region` is the part of the image that is
+        returned: x, y, width and height in pixels. Raises `ClientError`."""
         body = request_body(
-            camera, t, scene=scene, width=width, height=height, channels=channels, background=background,
-            shutter=shutter, dt=dt, steps=steps, format="npy",
+            camera, t, scene=scene, width=width, height=height, region=region, channels=channels,
+            background=background, shutter=shutter, dt=dt, steps=steps, format="npy",
         )  # fmt: skip
         response = self._call("POST", "/render", json=body)
         pixels = _array(response)
@@ -269,6 +271,7 @@ def request_body(
     scene: str | None = None,
     width: Whole | None = None,
     height: Whole | None = None,
+    region: Sequence[Whole] | None = None,
     format: Format = "png",
     quality: Whole | None = None,
     channels: Sequence[Channel] | None = None,
@@ -279,8 +282,8 @@ def request_body(
 ) -> dict[str, Any]:
     """Return the JSON body of `POST /render`; None is left out. Raises `ClientError` for what JSON can't hold."""
     values = {
-        "scene": scene, "camera": camera, "t": t, "width": width, "height": height, "format": format,
-        "quality": quality, "channels": channels, "background": background, "dt": dt, "steps": steps,
+        "scene": scene, "camera": camera, "t": t, "width": width, "height": height, "region": region,
+        "format": format, "quality": quality, "channels": channels, "background": background, "dt": dt, "steps": steps,
         "shutter": shutter,
     }  # fmt: skip
     return _plain(_given(values), "")

@@ -30,7 +30,7 @@ from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID
 from msdgs_serve.ray_blocks import draw_on_ray
 from msdgs_serve.ray_tasks import ray_cluster
 from msdgs_serve.renderer import Renderer, RenderOptions, check_times
-from msdgs_serve.scene import InvalidInput, MsdgsError
+from msdgs_serve.scene import InvalidInput, MsdgsError, Region
 from msdgs_serve.video import PIXELS, VIDEO_FORMATS, VideoFormat, check_size, pixels_of, require_pyav, write_video
 from msdgs_serve.writing import in_words, replacing, write_text, writing
 
@@ -90,6 +90,8 @@ def _add_path_options(group: argparse._ArgumentGroup) -> None:
     width = "Image width; by default the path's, else that of the scene's first camera."
     group.add_argument("--width", type=int, metavar="PIXELS", help=width)
     group.add_argument("--height", type=int, metavar="PIXELS", help="Image height, given together with --width.")
+    region = "Part of each image that is drawn: its left upper corner, width and height, in pixels."
+    group.add_argument("--region", type=int, nargs=4, metavar=("X", "Y", "WIDTH", "HEIGHT"), help=region)
 
 
 def _add_output_options(group: argparse._ArgumentGroup) -> None:
@@ -121,7 +123,10 @@ def _run(options: argparse.Namespace) -> None:
         raise InvalidInput("--dt", "left out, as only exr and npy hold motion vectors", options.dt)
     if options.dt is not None and not 0 < options.dt < math.inf:
         raise InvalidInput("--dt", "above 0", options.dt)
-    first = views[0].camera
+    region = None if options.region is None else Region(*options.region)
+    for view in views if region else ():
+        region.check(view.camera)
+    first = region or views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
     if is_video:
         check_size(cast(VideoFormat, video), first.width, first.height)
@@ -131,7 +136,8 @@ def _run(options: argparse.Namespace) -> None:
     _claim(folder, _record(options, views, image_format, transparent))
     files = [folder / f"frame_{number:05d}{FORMATS[image_format].extension}" for number in range(len(views))]
     background = "transparent" if transparent else "scene"
-    drawn = RenderOptions(background, motion_dt=options.dt, depth="depth" in default_channels(image_format))
+    has_depth = "depth" in default_channels(image_format)
+    drawn = RenderOptions(background, motion_dt=options.dt, depth=has_depth, region=region)
     _draw(views, files, OutputOptions(image_format, options.quality, drawn), options.ray)
     if is_video:
         with replacing(options.out) as temporary, temporary.open("wb") as file:
@@ -263,7 +269,7 @@ def _record(options: argparse.Namespace, views: Sequence[View], image_format: st
         digest.update(repr((camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, t)).encode())
         digest.update(camera.camera_to_world.tobytes())
     asked = {"format": image_format, "quality": options.quality, "transparent": transparent}
-    asked |= {} if options.dt is None else {"dt": options.dt}
+    asked |= {name: value for name in ("dt", "region") if (value := getattr(options, name)) is not None}
     return json.dumps({**asked, "sha256": digest.hexdigest()})
 
 

@@ -10,7 +10,7 @@ from msdgs_serve.imaging import Image, average
 from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, as_trained, rasterize
 from msdgs_serve.render_job import RenderJob
-from msdgs_serve.scene import Camera, Gaussians, InvalidInput
+from msdgs_serve.scene import Camera, Gaussians, InvalidInput, Region
 
 Color = tuple[float, float, float]
 Background = Color | Literal["scene", "transparent"]
@@ -48,6 +48,7 @@ class RenderOptions:
     depth: bool = False  # also draw depth
     counts: bool = False  # also count the Gaussians that contribute to each pixel
     steps: float | None = None  # number of the scene's layers to apply; None: all
+    region: Region | None = None  # the part of the camera's image that is drawn; None: all of it
     rasterizer: RasterizerOptions = GSPLAT
 
 
@@ -119,12 +120,13 @@ class Renderer:
                 extra=extra,
                 counts=options.counts,
                 options=constants,
+                region=options.region,
             )
             transparent = options.background == "transparent"
             motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]
             counts = drawn.counts if options.counts else None
             depth = in_world_units(drawn.depth, place.scale) if options.depth else None
-            return Image(drawn.rgb, drawn.alpha, depth, transparent, camera, t, motion, counts)
+            return Image(drawn.rgb, drawn.alpha, depth, transparent, camera, t, motion, counts, options.region)
 
 
 def in_world_units(depth: np.ndarray, scale: float) -> np.ndarray:

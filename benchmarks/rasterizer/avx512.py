@@ -95,7 +95,8 @@ class Avx512Renderer:
             raise ValueError("it draws only with a pinhole camera, without mip filter and with SH of degree 3")
         if not all(array.dtype == np.float32 and array.flags.c_contiguous for array in arrays):
             raise ValueError("the Gaussians must be float32 in C order")
-        view = view_of(camera, options)._asdict() | options._asdict() | {"background": np.zeros(3)}
+        view = view_of(camera, options)._asdict() | options._asdict()
+        view |= {"width": camera.width, "height": camera.height, "background": np.zeros(3)}
         values = [view[name] for name, *_ in _View._fields_]
         rgb, seconds = np.empty((camera.height, camera.width, 3), np.float32), np.empty(4)
         self._library.draw(

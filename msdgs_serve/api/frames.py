@@ -20,7 +20,7 @@ from msdgs_serve.imaging.encode import check_encodable, npy, numbers
 from msdgs_serve.imaging.formats import default_channels
 from msdgs_serve.render_job import RenderJob
 from msdgs_serve.renderer import Background, RenderOptions, Shutter, check_times
-from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene import Camera, InvalidInput, Region
 from msdgs_serve.store import ServedScene
 
 IfNoneMatch = Annotated[
@@ -67,14 +67,20 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
     scene = service.scene(request.scene)
     camera = resolve_camera(request, scene)
     times = request.t if isinstance(request.t, list) else [request.t]
-    _check_amounts(service, request, camera, len(times))
+    region = None if request.region is None else Region(*request.region)
+    if region is not None:
+        region.check(camera)
+    size = camera if region is None else region
+    _check_amounts(service, request, size, len(times))
     background = _background(request)
     transparent = background == "transparent"
-    check_encodable(camera.width, camera.height, transparent, request.format, request.quality, request.channels)
+    check_encodable(size.width, size.height, transparent, request.format, request.quality, request.channels)
     shutter = None
     if request.shutter is not None:
         shutter = Shutter(request.shutter.open, request.shutter.close, request.shutter.samples)
     channels = request.channels or default_channels(request.format)
+    if region is not None and not FORMATS[request.format].holds_float:
+        _check_seamless(request, channels[0])
     if ("motion" in channels) != (request.dt is not None):
         expected = "given for the channel motion" if request.dt is None else "left out without the channel motion"
         raise InvalidInput("dt", expected, "nothing" if request.dt is None else request.dt)
@@ -88,6 +94,7 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
         depth="depth" in channels,
         counts="gaussians" in channels,
         steps=request.steps,
+        region=region,
     )
     etag = _etag(scene, request)
     return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
@@ -158,7 +165,16 @@ def _worst_decibels(scene: ServedScene) -> float | None:
     return float(value) if isinstance(value, int | float) else None
 
 
-def _check_amounts(service: Service, request: RenderRequest, camera: Camera, frames: int) -> None:
+def _check_seamless(request: RenderRequest, channel: Channel) -> None:
+    """Raise `InvalidInput` for a display image whose brightness depends on the whole image."""
+    if channel == "depth" and request.depth_range is None:
+        raise InvalidInput("depth_range", "given with region, whose nearest and farthest depths vary", "nothing")
+    if channel in ("motion", "gaussians"):
+        expected = f"left out for {channel} as {request.format}, which is relative to the largest value; use exr or npy"
+        raise InvalidInput("region", expected, list(request.region or ()))
+
+
+def _check_amounts(service: Service, request: RenderRequest, size: Camera | Region, frames: int) -> None:
     limits = service.settings
     if isinstance(request.t, list) and request.format != "npy":
         expected = "one time, except for `npy`; `POST /render/batch` renders many frames"
@@ -167,18 +183,19 @@ def _check_amounts(service: Service, request: RenderRequest, camera: Camera, fra
         raise InvalidInput("t", f"a list of at most {limits.max_batch} times", frames)
     if request.shutter is not None and request.shutter.samples > limits.max_samples:
         raise InvalidInput("shutter.samples", f"at most {limits.max_samples}", request.shutter.samples)
-    check_pixels(camera, frames, limits.max_pixels, limits.max_pixels, "t")
+    check_pixels(size, frames, limits.max_pixels, limits.max_pixels, "t")
 
 
-def check_pixels(camera: Camera, frames: int, limit: int, total: int, field: str) -> None:
+def check_pixels(size: Camera | Region, frames: int, limit: int, total: int, field: str) -> None:
     """Raise `InvalidInput` for more than `limit` pixels per frame or more than `total` pixels in all frames."""
-    pixels, size = camera.width * camera.height, f"{camera.width} × {camera.height}"
+    pixels, got = size.width * size.height, f"{size.width} × {size.height}"
     if pixels > limit:
-        larger = "width" if camera.width >= camera.height else "height"
-        raise InvalidInput(larger, f"such that width × height is at most {limit} pixels", size)
+        larger = "width" if size.width >= size.height else "height"
+        name = "region" if isinstance(size, Region) else larger
+        raise InvalidInput(name, f"such that width × height is at most {limit} pixels", got)
     if pixels * frames > total:
         expected = f"such that width × height × number of frames is at most {total} pixels"
-        raise InvalidInput(field, expected, f"{frames} of {size}")
+        raise InvalidInput(field, expected, f"{frames} of {got}")
 
 
 def _background(request: RenderRequest) -> Background:

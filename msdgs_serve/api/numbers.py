@@ -16,6 +16,7 @@ FieldOfView = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.01, 
 Elevation = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-89.9, le=89.9)]
 FramesPerSecond = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_FPS, le=MAX_FPS)]
 Pixels = Annotated[int, Field(strict=True, ge=1, le=MAX_PIXELS_PER_SIDE)]
+LeastPixel = Annotated[int, Field(strict=True, ge=0, lt=MAX_PIXELS_PER_SIDE)]
 Index = Annotated[int, Field(strict=True, ge=0, le=1_000_000)]
 Samples = Annotated[int, Field(strict=True, ge=1, le=10_000)]
 Quality = Annotated[int, Field(strict=True, ge=1, le=100)]

@@ -22,6 +22,8 @@ def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:
     body |= {"camera": _camera(given), "t": given.get("t", metadata.time_range[0])}
     if "channels" in given:
         body["channels"] = given["channels"].split(",")
+    if "region" in given:
+        body["region"] = _numbers("region", given["region"], int)
     if "background" in given:
         text = given["background"]
         body["background"] = _numbers("background", text) if "," in text else text
@@ -63,11 +65,12 @@ def _camera(given: dict[str, Any]) -> dict[str, Any]:
     return camera
 
 
-def _numbers(name: str, text: str) -> list[float]:
+def _numbers(name: str, text: str, kind: type[float] | type[int] = float) -> list[float]:
     try:
-        return [float(part) for part in text.split(",")]
+        return [kind(part) for part in text.split(",")]
     except ValueError:
-        raise InvalidInput(name, "comma-separated numbers", repr(text[:20])) from None
+        expected = "comma-separated numbers" if kind is float else "comma-separated whole numbers"
+        raise InvalidInput(name, expected, repr(text[:20])) from None
 
 
 def _parameter(location: tuple[str | int, ...]) -> str:

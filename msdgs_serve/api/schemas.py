@@ -19,6 +19,7 @@ from msdgs_serve.api.numbers import (
     LaxPixels,
     LaxQuality,
     LaxSteps,
+    LeastPixel,
     List,
     Name,
     Number,
@@ -166,6 +167,13 @@ class RenderRequest(Strict):
         "camera; if one is given, the other follows from the aspect ratio",
     )
     height: Pixels | None = Field(default=None, description="pixels; see `width`")
+    region: tuple[LeastPixel, LeastPixel, Pixels, Pixels] | None = Field(
+        default=None,
+        description="x, y, width and height of the part of the image to render, in pixels from its upper left corner; "
+        "default: all. Its pixels are exactly those of the whole image, and only they count for limits. `exr` stores "
+        "it as the data window. In 8-bit formats `depth` needs `depth_range`",
+        examples=[[256, 0, 128, 128]],
+    )
     format: ImageFormat = Field(
         default="png",
         description="`png`: 8-bit sRGB. `jpeg`, `webp`: the same, lossy. `exr`: 32-bit float scene-linear Rec.709 "
@@ -215,6 +223,7 @@ class RenderQuery(BaseModel):
     steps: LaxSteps | None = Field(default=None, description="as in `POST /render`")
     width: LaxPixels | None = Field(default=None, description="pixels")
     height: LaxPixels | None = Field(default=None, description="pixels")
+    region: List | None = Field(default=None, description="as in `POST /render`", examples=["256,0,128,128"])
     format: ImageFormat = Field(default="png", description="as in `POST /render`")
     quality: LaxQuality | None = Field(default=None, description="quality of `jpeg` and `webp`")
     channels: List | None = Field(default=None, examples=["depth"])

@@ -146,6 +146,9 @@ def _exr_spec(image: Image, channels: Sequence[Channel]) -> oiio.ImageSpec:
     names = [name for channel in channels for name in EXR_NAMES[channel]]
     spec = oiio.ImageSpec(image.width, image.height, len(names), oiio.FLOAT)
     spec.channelnames = tuple(names)
+    if image.region is not None and image.camera is not None:  # data window and display window
+        spec.x, spec.y = image.region.x, image.region.y
+        spec.full_width, spec.full_height = image.camera.width, image.camera.height
     spec.alpha_channel = names.index("A") if "A" in names else -1
     spec.z_channel = names.index("Z") if "Z" in names else -1
     _set(spec, EXR_ATTRIBUTES)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_serve.scene import Camera, InvalidInput, Region
 from msdgs_serve.scene.gaussians import FloatArray
 
 
@@ -25,6 +25,7 @@ class Image:
     t: float | None = None  # scene time
     motion: FloatArray | None = None  # [H, W, 2] displacement, pixels to the right and down; 0 if alpha is 0
     gaussians: FloatArray | None = None  # [H, W] number that contribute to each pixel
+    region: Region | None = None  # of the camera's image; None: all of it
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3:

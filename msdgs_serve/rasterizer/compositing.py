@@ -91,7 +91,10 @@ def composite(
     count = len(tiles.offsets) - 1
     for first in range(0, count, TILES_PER_ROUND):
         counters, past = np.array([first, first]), min(first + TILES_PER_ROUND, count)
-        run_together(_composite_tiles, (counters, past, splats.records, tiles, limits, background, depths, frame))
+        run_together(
+            _composite_tiles,
+            (counters, past, splats.records, splats.origin, tiles, limits, background, depths, frame),
+        )
     return frame
 
 
@@ -100,6 +103,7 @@ def _composite_tiles(
     counters: np.ndarray,
     past: int,
     records: np.ndarray,
+    origin: tuple[int, int],
     tiles: TileLists,
     limits: PixelLimits,
     background: np.ndarray,
@@ -138,7 +142,7 @@ def _composite_tiles(
                 count = min(end - entry, BATCH)
                 for k in range(np.uint64(0), count, np.uint64(NUM_LANES)):
                     columns = load_columns_of(records, tiles.splat_ids, entry + k)
-                    _mark_touching(columns, x0, y0, limits, k, batch, touching)
+                    _mark_touching(columns, origin[0] + x0, origin[1] + y0, limits, k, batch, touching)
                 valid = np.uint64(0xFFFFFFFFFFFFFFFF) >> (BATCH - count)
                 unfinished = False
                 for block in range(np.uint64(BLOCKS)):

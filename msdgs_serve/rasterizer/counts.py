@@ -29,13 +29,21 @@ def count_splats(splats: Splats, tiles: TileLists, width: int, height: int, opti
     limits = pixel_limits(options, splats.records.dtype)
     blended = np.empty((height, width), splats.records.dtype)
     ranges = split_evenly(len(tiles.offsets) - 1, 8 * threads_to_use())
-    evaluated = run_parallel(_count_tiles, [(*part, splats.records, tiles, limits, blended) for part in ranges])
+    evaluated = run_parallel(
+        _count_tiles, [(*part, splats.records, splats.origin, tiles, limits, blended) for part in ranges]
+    )
     return Counts(blended, sum(evaluated))
 
 
 @kernel
 def _count_tiles(
-    start: int, stop: int, records: np.ndarray, tiles: TileLists, limits: PixelLimits, blended: np.ndarray
+    start: int,
+    stop: int,
+    records: np.ndarray,
+    first: tuple[int, int],
+    tiles: TileLists,
+    limits: PixelLimits,
+    blended: np.ndarray,
 ) -> int:
     grid = grid_of_a_tile(records)
     record, origin = np.zeros(RECORD, records.dtype), np.zeros(RECORD, records.dtype)
@@ -45,7 +53,7 @@ def _count_tiles(
     evaluated = 0
     for tile in range(start, stop):
         x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
-        origin[0], origin[1] = x0, y0
+        origin[0], origin[1] = first[0] + x0, first[1] + y0
         state[:] = 1
         added[:] = 0
         for entry in range(tiles.offsets[tile], tiles.offsets[tile + 1]):

@@ -39,6 +39,7 @@ from msdgs_serve.rasterizer.splats import ROOT_SCALE, Splats, empty_records
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.region import Region
 from msdgs_serve.threads import run_together, threads_to_use
 
 PREFETCH_DISTANCE = 2 * NUM_LANES
@@ -47,13 +48,13 @@ MIN_PARTS = 8
 """Parts for two or more threads: the others start later, by the time that waking up takes, and do fewer parts."""
 
 
-def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) -> Splats:
-    """Project N Gaussians into the camera's image."""
+def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions, tiles: Region | None = None) -> Splats:
+    """Project N Gaussians into the camera's image, of which whole `tiles` are drawn, or all."""
     gaussians = _kernel_arrays(gaussians)
     if any(camera.distortion):
         gaussians = _without_ghosts(gaussians, camera)
     count, dtype = len(gaussians), gaussians.means.dtype
-    view = view_of(camera, options)
+    view = view_of(camera, options, tiles)
     records = empty_records(-(-count // NUM_LANES) * NUM_LANES, dtype)  # whole vectors: stores need no mask
     rectangles = np.empty((count, 4), np.uint16)
     keys = np.empty(count, np.uint64)
@@ -64,7 +65,8 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions) ->
     run_together(_project_parts, (counters, found, view, arrays, (records, rectangles, keys)))
     _, _, nearest, farthest, valid = found.T.tolist()
     drawn = found[:, :2].copy()  # a view of one row would be of another type, for which numba compiles again
-    return Splats(records[:count], rectangles, keys, drawn, (min(nearest), max(farthest)), all(valid))
+    origin, depth_range = (view.left, view.top), (min(nearest), max(farthest))
+    return Splats(records[:count], rectangles, keys, drawn, depth_range, origin, all(valid))
 
 
 def part_count(count: int) -> int:
@@ -127,6 +129,8 @@ def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: 
     double = np.empty(1, np.float64)
     depths = np.empty(NUM_LANES, records.dtype)
     r, t = view.rotation, view.translation
+    first_column, first_row = spread(real(view.left // TILE)), spread(real(view.top // TILE))
+    past_column, past_row = spread(real(-(-view.right // TILE))), spread(real(-(-view.bottom // TILE)))
     arrays = (
         (means.reshape(-1), np.uint64(3)),
         (quats.reshape(-1), np.uint64(4)),
@@ -174,8 +178,8 @@ def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: 
         extent_x = square_root(reach * converted(xx, records)) * 1.0001 + 1e-3
         extent_y = square_root(reach * converted(yy, records)) * 1.0001 + 1e-3
         drawn = drawn & (det > 0) & (det < np.inf)
-        drawn = drawn & (u + extent_x >= 0) & (u - extent_x <= view.width)
-        drawn = drawn & (v + extent_y >= 0) & (v - extent_y <= view.height)
+        drawn = drawn & (u + extent_x >= view.left) & (u - extent_x <= view.right)
+        drawn = drawn & (v + extent_y >= view.top) & (v - extent_y <= view.bottom)
         bits = bits_of(drawn)
         if bits == np.uint64(0):
             _store_nothing(records, first)
@@ -205,13 +209,13 @@ def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: 
                 select(drawn, extent_y, zero),
             ),
         )
-        scale, past_column, past_row = 1 / TILE, spread(real(view.tile_columns)), spread(real(view.tile_rows))
+        scale = 1 / TILE
         # clamped as floats: bounds of large splats overflow integers
         sides = (
-            select(drawn, maximum(scale * (u - extent_x), zero), zero),
-            select(drawn, minimum(scale * (u + extent_x) + 1, past_column), zero),
-            select(drawn, maximum(scale * (v - extent_y), zero), zero),
-            select(drawn, minimum(scale * (v + extent_y) + 1, past_row), zero),
+            select(drawn, maximum(scale * (u - extent_x), first_column) - first_column, zero),
+            select(drawn, minimum(scale * (u + extent_x) + 1, past_column) - first_column, zero),
+            select(drawn, maximum(scale * (v - extent_y), first_row) - first_row, zero),
+            select(drawn, minimum(scale * (v + extent_y) + 1, past_row) - first_row, zero),
         )
         store_uint16(rectangles, first, sides)
         store(depths, 0, converted(z, records))

@@ -9,12 +9,13 @@ import numpy.typing as npt
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.counts import count_splats
 from msdgs_serve.rasterizer.projection import project
-from msdgs_serve.rasterizer.splats import BLUE, RED, Splats, X, Y
+from msdgs_serve.rasterizer.splats import BLUE, RED, Splats
 from msdgs_serve.rasterizer.tiles import TileLists, TooManyPairs, bin_into_tiles
-from msdgs_serve.rasterizer.view import GSPLAT, TILE, RasterizerOptions
+from msdgs_serve.rasterizer.view import GSPLAT, TILE, RasterizerOptions, in_tiles
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.region import Region
 from msdgs_serve.threads import sharing_cores
 
 MAX_PAIRS = 1 << 28
@@ -41,8 +42,12 @@ def rasterize(
     extra: np.ndarray | None = None,
     counts: bool = False,
     options: RasterizerOptions = GSPLAT,
+    region: Region | None = None,
 ) -> Rendering:
     """Render the Gaussians (equations 1 and 2) over a background color.
+
+    With a `region`, only this part of the camera's image is drawn: the pixels that the whole image has there, bit by
+    bit. Gaussians outside of it cost their projection only.
 
     Depths are in scene units. `extra` [N, C] are any C numbers per Gaussian, blended like colors without a background;
     three of them take as long as the colors. `counts` takes a pass of its own.
@@ -50,26 +55,35 @@ def rasterize(
     Safe to call from several threads; the same input gives the same bytes, whatever the number of threads.
 
     Raises:
-        InvalidInput: if an array of the Gaussians, the background or an option breaks its contract, by name.
+        InvalidInput: if an array of the Gaussians, the background, an option or the region breaks its contract, by
+            name.
     """
     gaussians.validate_shapes()
     background = np.asarray(background, dtype=gaussians.means.dtype)
     if background.shape != (3,) or not np.isfinite(background).all():
         raise InvalidInput("background", "3 finite numbers", background.tolist())
-    splats = project(gaussians, camera, options)
+    region = region or Region.whole(camera)
+    region.check(camera)
+    area = in_tiles(region, camera)
+    splats = project(gaussians, camera, options, area)
     if not splats.valid:
         gaussians.validate()
     channels = _checked_extra(extra, gaussians)
 
     def draw(left: int, top: int, right: int, bottom: int) -> Rendering:
         size = right - left, bottom - top
-        part = splats if size == (camera.width, camera.height) else _cut(splats, left, top, right, bottom)
+        part = splats if size == area[2:] else _cut(splats, left, top, right, bottom)
         tiles = bin_into_tiles(part, *size, MAX_PAIRS)
         frame = composite(part, tiles, *size, background, options, depth=depth)
         counted = count_splats(part, tiles, *size, options).blended if counts else np.empty((0, 0), part.records.dtype)
         return Rendering(*frame, _drawn_extra(channels, part, tiles, size, options), counted)
 
-    return _in_parts(draw, 0, 0, camera.width, camera.height)
+    drawn = _in_parts(draw, area.x, area.y, area.right, area.bottom)
+    if area == region:
+        return drawn
+    rows = slice(region.y - area.y, region.bottom - area.y)
+    columns = slice(region.x - area.x, region.right - area.x)
+    return Rendering(*(np.ascontiguousarray(image[rows, columns]) for image in drawn))
 
 
 def _in_parts(draw: Callable[..., Rendering], left: int, top: int, right: int, bottom: int) -> Rendering:
@@ -89,13 +103,11 @@ def _in_parts(draw: Callable[..., Rendering], left: int, top: int, right: int, b
 
 
 def _cut(splats: Splats, left: int, top: int, right: int, bottom: int) -> Splats:
-    """Return the splats relative to the corner of an area of whole tiles, each with the tiles that are inside."""
-    records = splats.records.copy()
-    records[:, X] -= left
-    records[:, Y] -= top
-    first = np.array([left, left, top, top], np.uint16) // TILE
-    past = (np.array([right, right, bottom, bottom], np.uint16) + (TILE - 1)) // TILE
-    return splats._replace(records=records, rectangles=splats.rectangles.clip(first, past) - first)
+    """Return the splats for an area of whole tiles of the camera's image, each with the tiles that are inside."""
+    x, y = splats.origin
+    first = np.array([left - x, left - x, top - y, top - y], np.uint16) // TILE
+    past = (np.array([right - x, right - x, bottom - y, bottom - y], np.uint16) + (TILE - 1)) // TILE
+    return splats._replace(rectangles=splats.rectangles.clip(first, past) - first, origin=(left, top))
 
 
 def _checked_extra(extra: np.ndarray | None, gaussians: Gaussians) -> np.ndarray:

@@ -28,10 +28,11 @@ class Splats(NamedTuple):
     """
 
     records: np.ndarray  # [N, RECORD]
-    rectangles: np.ndarray  # [N, 4] uint16: tile columns [first, past), then tile rows [first, past)
+    rectangles: np.ndarray  # [N, 4] uint16: tile columns [first, past), then tile rows [first, past), from `origin`
     keys: np.ndarray  # [N] uint64: for each drawn splat the bits of its float32 depth above its index
     drawn: np.ndarray  # [P, 2] start and stop of the ranges of `keys` that are filled, by index
     depth_range: tuple[int, int]  # bits of the smallest and the largest drawn depth
+    origin: tuple[int, int]  # upper left corner of the first tile in the camera's image, pixels
     valid: bool  # whether all Gaussians pass `Gaussians.validate`; SH coefficients are checked if drawn
 
     @property

@@ -8,6 +8,7 @@ import numpy as np
 from msdgs_serve.scene.camera import Camera, CameraModel
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.metadata import SceneMetadata
+from msdgs_serve.scene.region import Region
 
 TILE = 16
 """Pixels along a tile's side."""
@@ -33,6 +34,13 @@ def as_trained(metadata: SceneMetadata, options: RasterizerOptions = GSPLAT) -> 
     return options._replace(eps2d=metadata.eps2d, mip=metadata.antialiasing == "mip")
 
 
+def in_tiles(region: Region, camera: Camera) -> Region:
+    """Return the tiles that a part of a camera's image touches, as far as they are in the image."""
+    x, y = region.x // TILE * TILE, region.y // TILE * TILE
+    right, bottom = -(-region.right // TILE) * TILE, -(-region.bottom // TILE) * TILE
+    return Region(x, y, min(right, camera.width) - x, min(bottom, camera.height) - y)
+
+
 PINHOLE, ORTHOGRAPHIC, FISHEYE = range(len(get_args(CameraModel)))
 
 
@@ -46,8 +54,11 @@ class View(NamedTuple):
     fy: float
     cx: float
     cy: float
-    width: int
-    height: int
+    # the part of the image that is drawn, in pixels; its left and upper sides are those of tiles
+    left: int
+    right: int
+    top: int
+    bottom: int
     # where x/z and y/z are clamped in the Jacobian, so that splats far off axis stay finite (gsplat's limits)
     min_x: float
     max_x: float
@@ -60,12 +71,12 @@ class View(NamedTuple):
     mip: bool
     alpha_min: float
     log2_alpha_min: float
-    tile_columns: int
-    tile_rows: int
 
 
-def view_of(camera: Camera, options: RasterizerOptions) -> View:
-    """Return the kernels' form of a camera. Raises `InvalidInput` for options out of range."""
+def view_of(camera: Camera, options: RasterizerOptions, tiles: Region | None = None) -> View:
+    """Return the kernels' form of a camera of whose image whole `tiles` are drawn, or all. Raises `InvalidInput` for
+    options out of range."""
+    tiles = tiles or Region.whole(camera)
     _check(options)
     rotation, position = np.ascontiguousarray(camera.camera_to_world[:3, :3].T), camera.position
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
@@ -77,8 +88,10 @@ def view_of(camera: Camera, options: RasterizerOptions) -> View:
         fy=camera.fy,
         cx=camera.cx,
         cy=camera.cy,
-        width=camera.width,
-        height=camera.height,
+        left=tiles.x,
+        right=tiles.right,
+        top=tiles.y,
+        bottom=tiles.bottom,
         min_x=-camera.cx / camera.fx - margin_x,
         max_x=(camera.width - camera.cx) / camera.fx + margin_x,
         min_y=-camera.cy / camera.fy - margin_y,
@@ -90,8 +103,6 @@ def view_of(camera: Camera, options: RasterizerOptions) -> View:
         mip=bool(options.mip),
         alpha_min=float(options.alpha_min),
         log2_alpha_min=math.log2(options.alpha_min),
-        tile_columns=-(-camera.width // TILE),
-        tile_rows=-(-camera.height // TILE),
     )
 
 

@@ -3,5 +3,6 @@
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.region import Region
 
-__all__ = ["Camera", "Gaussians", "InvalidInput", "MsdgsError", "SceneFileInvalid", "SceneNotFound"]
+__all__ = ["Camera", "Gaussians", "InvalidInput", "MsdgsError", "Region", "SceneFileInvalid", "SceneNotFound"]

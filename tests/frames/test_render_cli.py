@@ -31,6 +31,17 @@ def test_images_of_an_orbit(scene: Path, tmp_path: Path, capsys: pytest.CaptureF
     assert "frame 3 of 3" in printed.err
 
 
+def test_a_region_of_each_image(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    command = ("--frames", 2, "--width", 40, "--height", 30)
+    assert run(scene, tmp_path / "whole", *command) == 0
+    assert run(scene, tmp_path / "part", *command, "--region", 9, 5, 20, 16) == 0
+    for name in ("frame_00000.png", "frame_00001.png"):
+        whole, part = (decode((tmp_path / folder / name).read_bytes(), "png")[0] for folder in ("whole", "part"))
+        assert (part == whole[5:21, 9:29]).all()
+    assert "2 frames of 20 × 16" in capsys.readouterr().out
+    assert run(scene, tmp_path / "part", *command, "--region", 8, 5, 20, 16) == 2, "frames of another region"
+
+
 @pytest.mark.parametrize(
     ("out", "size", "named"),
     [("frames", 300, "frames"), ("orbit.mp4", 1500, "orbit.mp4"), ("frames", 60, "frames/msdgs-render.json")],
@@ -111,6 +122,7 @@ def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
         (["scene", "video.webp", "--width", "16384", "--height", "2"], "width"),
         (["scene", "taken"], "an empty folder"),
         (["missing.onnx", "out"], "missing.onnx"),
+        (["scene", "out", "--region", "0", "0", "9999", "1"], "region"),
         (["scene", "out", "--quality", "80"], "quality"),
     ],
 )

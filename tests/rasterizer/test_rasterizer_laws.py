@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from msdgs_serve.rasterizer import GSPLAT, INRIA, Rendering, rasterize
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.tiles import SPLATS_PER_PART, TooManyPairs, bin_into_tiles
-from msdgs_serve.scene import Camera, Gaussians, InvalidInput
+from msdgs_serve.scene import Camera, Gaussians, InvalidInput, Region
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
 from tests.support import reference
 from tests.support.scenes import as_dtype, draw, front_camera, gaussians_of, joined, random_scene, select, unit_quats
@@ -172,15 +173,68 @@ def test_an_image_drawn_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch, ma
     gaussians, camera = scene(21, dtype)
     extra = np.random.default_rng(0).uniform(size=(len(gaussians), 2)).astype(dtype)
     all_channels = {"background": BACKGROUND, "extra": extra, "counts": True}
-    clear, whole = clear_pixels(gaussians, camera), draw(gaussians, camera, **all_channels)
+    whole = draw(gaussians, camera, **all_channels)
     monkeypatch.setattr(sys.modules[rasterize.__module__], "MAX_PAIRS", max_pairs)
-    parts = draw(gaussians, camera, **all_channels)
-    assert_same(parts, whole, clear)
-    assert_close(parts.extra[clear], whole.extra[clear], f"rgb.{np.dtype(dtype).name}")
-    np.testing.assert_array_equal(parts.counts[clear], whole.counts[clear])
+    assert_identical(draw(gaussians, camera, **all_channels), whole)
     assert [channel.shape for channel in draw(gaussians, camera)] == [
         *(channel.shape for channel in whole[:3]), (*whole.alpha.shape, 0), (0, 0)
     ]  # fmt: skip
+
+
+def cut(whole: Rendering, region: Region) -> Rendering:
+    """Return the part of each image that a region shows."""
+    return Rendering(*(image[region.y : region.bottom, region.x : region.right] for image in whole))
+
+
+@DTYPES
+@pytest.mark.parametrize("count", [150, 2 * SPLATS_PER_PART])
+@pytest.mark.parametrize(
+    "change",
+    [{}, {"model": "fisheye", "distortion": (0.1, 0.02, 0.0, 0.0)}, {"model": "orthographic"}],
+    ids=["pinhole", "fisheye", "orthographic"],
+)
+def test_a_region_is_a_part_of_the_image(change: dict[str, Any], count: int, dtype: type):
+    gaussians, camera = scene(20, dtype, count)
+    camera = replace(camera.resized(93, 71), **change)
+    random = np.random.default_rng(0)
+    extra = random.uniform(size=(count, 2)).astype(dtype)
+    channels = {"background": BACKGROUND, "depth": True, "extra": extra, "counts": True}
+    options = (GSPLAT, INRIA, GSPLAT._replace(eps2d=0.1, mip=True))[int(random.integers(3))]
+    whole = rasterize(gaussians, camera, options=options, **channels)
+    corners = [random.integers((93, 71), endpoint=True, size=(2, 2)) for _ in range(6)]
+    regions = [
+        Region(16, 16, 32, 48), Region(92, 70, 1, 1), Region.whole(camera),
+        *(Region(*map(int, (*a.min(0), *np.ptp(a, axis=0)))) for a in corners if np.ptp(a, axis=0).all()),
+    ]  # fmt: skip
+    for region in regions:
+        assert_identical(rasterize(gaussians, camera, options=options, region=region, **channels), cut(whole, region))
+
+
+@DTYPES
+def test_regions_of_a_huge_image_fit_together(monkeypatch: pytest.MonkeyPatch, dtype: type):
+    """At the far corner of an image of 16,384 × 8,192 pixels, whole tiles or not, drawn in parts or at once."""
+    gaussians, camera = scene(20, dtype, 2_000)
+    camera = camera.resized(16_384, 8_192)
+    seen = camera.project(gaussians.means)[0]
+    x, y = (int(value) for value in np.clip(seen[seen[:, 0] > 8_192].mean(axis=0), 0, (16_000, 8_000)))
+    whole = rasterize(gaussians, camera, region=Region(x, y, 150, 130))
+    assert whole.alpha.max() > 0
+    for left, top, right, bottom in ((0, 0, 61, 33), (61, 0, 150, 33), (0, 33, 61, 130), (61, 33, 150, 130)):
+        region = Region(x + left, y + top, right - left, bottom - top)
+        part = rasterize(gaussians, camera, region=region)
+        for got, want in zip(part[:2], whole[:2], strict=True):
+            np.testing.assert_array_equal(got, want[top:bottom, left:right])
+    monkeypatch.setattr(sys.modules[rasterize.__module__], "MAX_PAIRS", 50)
+    np.testing.assert_array_equal(rasterize(gaussians, camera, region=Region(x, y, 150, 130)).rgb, whole.rgb)
+
+
+@pytest.mark.parametrize(
+    "region", [(0, 0, 0, 5), (-1, 0, 5, 5), (60, 0, 5, 5), (0, 45, 5, 4), (0.0, 0, 5, 5), (0, 0, 5, True)]
+)
+def test_a_region_outside_of_the_image_is_refused(region: tuple[Any, ...]):
+    gaussians, camera = scene(20, np.float32)
+    with pytest.raises(InvalidInput, match="region"):
+        rasterize(gaussians, camera.resized(64, 48), region=Region(*region))
 
 
 @pytest.mark.parametrize("count", [10, SPLATS_PER_PART])

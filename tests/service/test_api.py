@@ -71,6 +71,60 @@ def test_layers_are_applied_one_after_the_other(tmp_path: Path, client: httpx.Cl
     check_problem(client.post("/render", json={**FRAME, "steps": 0}), 422, "steps")
 
 
+def test_a_region_is_a_part_of_the_image(client: httpx.Client):
+    x, y, width, height = region = [11, 20, 37, 30]
+
+    def part(of: np.ndarray) -> np.ndarray:
+        return of[..., y : y + height, x : x + width, :]
+
+    for changes in (
+        {"format": "png"},
+        {"format": "png", "channels": ["depth"], "depth_range": [4, 6]},
+        {"format": "npy", "channels": ["rgb", "alpha", "depth", "motion", "gaussians"], "dt": 0.1},
+        {"format": "npy", "t": [0.0, 0.7], "shutter": {"open": 0.0, "close": 0.1, "samples": 2}},
+        {"format": "exr"},
+    ):
+        whole = render(client, **changes)
+        np.testing.assert_array_equal(render(client, **changes, region=region), part(whole))
+        np.testing.assert_array_equal(render(client, **changes, region=[0, 0, SIZE, SIZE]), whole)
+    body = client.post("/render", json={**FRAME, "format": "exr", "region": region}).content
+    spec = decode(body, "exr")[1]
+    assert (spec.x, spec.y, spec.width, spec.height) == tuple(region)
+    assert (spec.full_x, spec.full_y, spec.full_width, spec.full_height) == (0, 0, SIZE, SIZE)
+    link = f"/render?azimuth=0&elevation=0&distance=5&fov_y=40&width={SIZE}&height={SIZE}&region=11,20,37,30"
+    np.testing.assert_array_equal(decode(client.get(link).content, "png")[0], part(render(client)))
+    check_problem(client.get(f"{link[:-1]}x"), 422, "region")
+
+
+def test_parts_of_an_image_beyond_the_limit_of_pixels_are_drawn(client: httpx.Client):
+    """16,384 × 8,192 pixels are 15 times the limit. Neighboring parts are those of one larger part."""
+    huge = {"width": 16_384, "height": 8_192, "format": "npy"}
+    whole = render(client, **huge, region=[8_100, 4_000, 100, 90])
+    assert whole[..., 3].max() > 0
+    parts = [render(client, **huge, region=[8_100 + x, 4_000, width, 90]) for x, width in ((0, 33), (33, 67))]
+    np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
+    check_problem(client.post("/render", json={**FRAME, **huge}), 422, "width")
+    check_problem(client.post("/render", json={**FRAME, **huge, "region": [0, 0, 16_384, 4_096]}), 422, "region")
+
+
+@pytest.mark.parametrize(
+    ("changes", "field"),
+    [
+        ({"region": [0, 0, SIZE + 1, 1]}, "region"),
+        ({"region": [SIZE, 0, 1, 1]}, "region"),
+        ({"region": [0, 0, 8, 0]}, "region.3"),
+        ({"region": [-1, 0, 8, 8]}, "region.0"),
+        ({"region": [0, 0.5, 8, 8]}, "region.1"),
+        ({"region": [0, 0, 8]}, "region.3"),
+        ({"region": [0, 0, 8, 8], "channels": ["depth"]}, "depth_range"),
+        ({"region": [0, 0, 8, 8], "channels": ["gaussians"]}, "region"),
+        ({"region": [0, 0, 8, 8], "channels": ["motion"], "dt": 0.1}, "region"),
+    ],
+)
+def test_regions_that_cannot_be_drawn(client: httpx.Client, changes: dict[str, Any], field: str):
+    check_problem(client.post("/render", json={**FRAME, **changes}), 422, field)
+
+
 def test_cameras_of_other_models(client: httpx.Client):
     """All models agree at the center of the image and differ away from it."""
     pose = level_camera(SIZE).camera_to_world

@@ -58,6 +58,12 @@ def test_frames_are_arrays_as_drawn(client: Client, scene: Path):
     assert {"queue", "pose", "draw", "encode"} == set(frame.milliseconds)
 
 
+def test_a_region_of_a_frame(client: Client):
+    whole = client.render(LEVEL, 0.3, width=SIZE, height=SIZE)
+    part = client.render(LEVEL, 0.3, width=SIZE, height=SIZE, region=np.array([5, 7, 20, 9]))
+    np.testing.assert_array_equal(part.rgb, whole.rgb[7:16, 5:25])
+
+
 def test_every_kind_of_camera(client: Client):
     pose, focal = level_camera().camera_to_world, SIZE / 2 / np.tan(np.radians(20))
     expected = client.render(LEVEL, 0.0, width=SIZE, height=SIZE).rgb
