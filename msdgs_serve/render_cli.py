@@ -124,8 +124,9 @@ def _run(options: argparse.Namespace) -> None:
     if options.dt is not None and not 0 < options.dt < math.inf:
         raise InvalidInput("--dt", "above 0", options.dt)
     region = None if options.region is None else Region(*options.region)
-    for view in views if region else ():
-        region.check(view.camera)
+    if region:
+        for view in views:
+            region.check(view.camera)
     first = region or views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
     if is_video:

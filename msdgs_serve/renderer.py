@@ -121,6 +121,7 @@ class Renderer:
                 counts=options.counts,
                 options=constants,
                 region=options.region,
+                static=session.scene.static_bounds,
             )
             transparent = options.background == "transparent"
             motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]

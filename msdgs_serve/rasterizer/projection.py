@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from msdgs_serve.rasterizer.atomic import DONE, TAKEN, all_done, fetch_add
+from msdgs_serve.rasterizer.culling import seen_blocks
 from msdgs_serve.rasterizer.geometry import covariance2d, direction, half_axis, project_points, rotate, rotation_columns
 from msdgs_serve.rasterizer.harmonics import raw_colors
 from msdgs_serve.rasterizer.jit import kernel
@@ -40,6 +41,7 @@ from msdgs_serve.rasterizer.view import TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.region import Region
+from msdgs_serve.scene.static_bounds import BLOCK, StaticBounds
 from msdgs_serve.threads import run_together, threads_to_use
 
 PREFETCH_DISTANCE = 2 * NUM_LANES
@@ -48,8 +50,15 @@ MIN_PARTS = 8
 """Parts for two or more threads: the others start later, by the time that waking up takes, and do fewer parts."""
 
 
-def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions, tiles: Region | None = None) -> Splats:
-    """Project N Gaussians into the camera's image, of which whole `tiles` are drawn, or all."""
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    options: RasterizerOptions,
+    tiles: Region | None = None,
+    static: StaticBounds | None = None,
+) -> Splats:
+    """Project N Gaussians into the camera's image, of which whole `tiles` are drawn, or all. Of `static` ones,
+    blocks that can't be seen are not read and have no records."""
     gaussians = _kernel_arrays(gaussians)
     if any(camera.distortion):
         gaussians = _without_ghosts(gaussians, camera)
@@ -62,7 +71,8 @@ def project(gaussians: Gaussians, camera: Camera, options: RasterizerOptions, ti
     arrays = (g.means, g.quats, g.scales, g.opacities, g.sh.reshape(count, 3 * g.sh.shape[1]))
     found = np.empty((part_count(count), 5), np.int64)
     counters = np.zeros(2, np.int64)
-    run_together(_project_parts, (counters, found, view, arrays, (records, rectangles, keys)))
+    seen = np.empty(0, np.uint8) if static is None else seen_blocks(static, view, count)
+    run_together(_project_parts, (counters, found, view, seen, arrays, (records, rectangles, keys)))
     _, _, nearest, farthest, valid = found.T.tolist()
     drawn = found[:, :2].copy()  # a view of one row would be of another type, for which numba compiles again
     origin, depth_range = (view.left, view.top), (min(nearest), max(farthest))
@@ -102,24 +112,29 @@ def _kernel_arrays(gaussians: Gaussians) -> Gaussians:
 
 
 @kernel
-def _project_parts(counters: np.ndarray, found: np.ndarray, view: View, gaussians: tuple, splats: tuple) -> bool:
+def _project_parts(
+    counters: np.ndarray, found: np.ndarray, view: View, seen: np.ndarray, gaussians: tuple, splats: tuple
+) -> bool:
     """Project parts until none is left, and write for each its start and the results of `_project_range` into `found`,
     [P, 5]. Return whether all parts are done.
 
-    `gaussians` are the arrays of `Gaussians` with flattened SH; `splats` are records, rectangles and keys of `Splats`.
+    `seen` are the blocks that are read, or none to read all. `gaussians` are the arrays of `Gaussians` with flattened
+    SH; `splats` are records, rectangles and keys of `Splats`.
     """
     while True:
         k = fetch_add(counters, TAKEN, 1)
         if k >= len(found):
             return all_done(counters, len(found))
         start, stop = part_range(k, len(found), len(gaussians[0]))
-        end, nearest, farthest, valid = _project_range(start, stop, view, gaussians, splats)
+        end, nearest, farthest, valid = _project_range(start, stop, view, seen, gaussians, splats)
         found[k, 0], found[k, 1], found[k, 2], found[k, 3], found[k, 4] = start, end, nearest, farthest, valid
         fetch_add(counters, DONE, 1)
 
 
 @kernel
-def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: tuple) -> tuple[int, int, int, bool]:
+def _project_range(
+    start: int, stop: int, view: View, seen: np.ndarray, gaussians: tuple, splats: tuple
+) -> tuple[int, int, int, bool]:
     """Project Gaussians `start` to `stop`; keys of drawn splats are written from `start`. Return the end of the keys,
     the bits of the smallest and the largest drawn depth, and whether all values that were read are valid."""
     means, quats, scales, opacities, sh = gaussians
@@ -139,6 +154,8 @@ def _project_range(start: int, stop: int, view: View, gaussians: tuple, splats: 
     )
     found, nearest, farthest, valid = start, np.uint64(0xFFFFFFFF), np.uint64(0), True
     for first in range(start, stop, NUM_LANES):
+        if len(seen) > 0 and seen[first // BLOCK] == 0:
+            continue
         for array, numbers in arrays:
             upcoming = np.uint64(first + PREFETCH_DISTANCE) * numbers
             for place in range(upcoming, upcoming + np.uint64(NUM_LANES) * numbers, np.uint64(NUM_LANES)):

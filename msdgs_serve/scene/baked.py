@@ -2,6 +2,7 @@
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
 from msdgs_serve.scene.gaussians import FloatArray, Gaussians
 from msdgs_serve.scene.metadata import CONTRACT, SceneCamera, SceneMetadata
 from msdgs_serve.scene.spherical_harmonics import sh_coefficients
+from msdgs_serve.scene.static_bounds import StaticBounds, static_bounds
 
 __all__ = [
     "CONSTANT_OUTPUTS",
@@ -81,6 +83,11 @@ class BakedScene:
         """The static Gaussians' values of `posed_outputs`."""
         appearance = (getattr(self, name) for name in self.changing)
         return (self.static_means, self.static_quats, self.static_scales, *appearance)
+
+    @cached_property
+    def static_bounds(self) -> StaticBounds:
+        """Bounds of the static Gaussians, for `rasterize`."""
+        return static_bounds(self.moving_count, self.static_means, self.static_scales)
 
     def __len__(self) -> int:
         return self.moving_count + self.static_count
