@@ -50,7 +50,7 @@ from msdgs_serve.rasterizer.tile_blocks import (
     max_distance,
     touches_block,
 )
-from msdgs_serve.rasterizer.tile_output import clear_tile, prefetch_tile, write_cut_tile, write_tile
+from msdgs_serve.rasterizer.tile_output import clear_tile, copy_tile, prefetch_tile, write_cut_tile, write_tile
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
 from msdgs_serve.threads import run_together
@@ -72,6 +72,13 @@ class Frame(NamedTuple):
     depth: np.ndarray  # [H, W] mean distance along the camera axis, infinite if alpha is 0; [0, 0] if not drawn
 
 
+class Still(NamedTuple):
+    """An image that is already drawn, and the tiles of it that have to be drawn again."""
+
+    frame: Frame
+    redrawn: np.ndarray  # [tiles] uint8
+
+
 def composite(
     splats: Splats,
     tiles: TileLists,
@@ -81,19 +88,21 @@ def composite(
     options: RasterizerOptions,
     *,
     depth: bool = False,
+    still: Still | None = None,
 ) -> Frame:
-    """Blend the splats into an image."""
+    """Blend the splats into an image. Tiles of `still` that aren't drawn again are copied."""
     dtype = splats.records.dtype
     shapes = ((height, width, 3), (height, width), (height, width) if depth else (0, 0))
     frame = Frame(*(np.empty(shape, dtype) for shape in shapes))
     depths = (True,) if depth else ()
     limits = pixel_limits(options, dtype)
+    still = still or Still(Frame(*(np.empty((0,) * image.ndim, dtype) for image in frame)), np.empty(0, np.uint8))
     count = len(tiles.offsets) - 1
     for first in range(0, count, TILES_PER_ROUND):
         counters, past = np.array([first, first]), min(first + TILES_PER_ROUND, count)
         run_together(
             _composite_tiles,
-            (counters, past, splats.records, splats.origin, tiles, limits, background, depths, frame),
+            (counters, past, splats.records, splats.origin, tiles, limits, background, depths, still, frame),
         )
     return frame
 
@@ -108,6 +117,7 @@ def _composite_tiles(
     limits: PixelLimits,
     background: np.ndarray,
     depths: tuple,
+    still: Still,
     frame: Frame,
 ) -> bool:
     """Draw tiles up to the tile `past`, `TILES_PER_TURN` at a time. Return whether all of them are drawn.
@@ -130,6 +140,10 @@ def _composite_tiles(
         end_of_turn = min(first + TILES_PER_TURN, past)
         for tile in range(first, end_of_turn):
             x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
+            if len(still.redrawn) > 0 and still.redrawn[tile] == 0:
+                size = (min(TILE, width - x0), min(TILE, height - y0))
+                copy_tile(x0, y0, size, depths, (still.frame.rgb, still.frame.alpha, still.frame.depth), frame)
+                continue
             prefetch_tile(width, x0, y0, min(TILE, height - y0), depths, pixels)
             clear_tile(state, depths)
             alive[:] = True

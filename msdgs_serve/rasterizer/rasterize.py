@@ -32,6 +32,14 @@ class Rendering(NamedTuple):
     extra: np.ndarray  # [H, W, C] blended as colors are; divide by alpha for a mean
     counts: np.ndarray  # [H, W] Gaussians that contribute to each pixel; [0, 0] if not requested
 
+    def cut(self, area: Region, region: Region) -> "Rendering":
+        """Return the part that shows `region`, of images that show `area`."""
+        if area == region:
+            return self
+        rows = slice(region.y - area.y, region.bottom - area.y)
+        columns = slice(region.x - area.x, region.right - area.x)
+        return Rendering(*(np.ascontiguousarray(image[rows, columns]) for image in self))
+
 
 @sharing_cores()
 def rasterize(
@@ -62,9 +70,7 @@ def rasterize(
             name.
     """
     gaussians.validate_shapes()
-    background = np.asarray(background, dtype=gaussians.means.dtype)
-    if background.shape != (3,) or not np.isfinite(background).all():
-        raise InvalidInput("background", "3 finite numbers", background.tolist())
+    background = checked_background(background, gaussians.means.dtype)
     region = region or Region.whole(camera)
     region.check(camera)
     area = in_tiles(region, camera)
@@ -81,12 +87,15 @@ def rasterize(
         counted = count_splats(part, tiles, *size, options).blended if counts else np.empty((0, 0), part.records.dtype)
         return Rendering(*frame, _drawn_extra(channels, part, tiles, size, options), counted)
 
-    drawn = _in_parts(draw, area.x, area.y, area.right, area.bottom)
-    if area == region:
-        return drawn
-    rows = slice(region.y - area.y, region.bottom - area.y)
-    columns = slice(region.x - area.x, region.right - area.x)
-    return Rendering(*(np.ascontiguousarray(image[rows, columns]) for image in drawn))
+    return _in_parts(draw, area.x, area.y, area.right, area.bottom).cut(area, region)
+
+
+def checked_background(background: npt.ArrayLike, dtype: np.dtype) -> np.ndarray:
+    """Return a background color as an array, [3]. Raises `InvalidInput`."""
+    color = np.asarray(background, dtype=dtype)
+    if color.shape != (3,) or not np.isfinite(color).all():
+        raise InvalidInput("background", "3 finite numbers", color.tolist())
+    return color
 
 
 def _in_parts(draw: Callable[..., Rendering], left: int, top: int, right: int, bottom: int) -> Rendering:

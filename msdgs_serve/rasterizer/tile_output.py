@@ -92,3 +92,16 @@ def write_cut_tile(
                 rgb[3 * pixel + channel] = state[place + PIXELS * (1 + channel)]
             if len(depths) > 0:
                 depth[pixel] = state[place + 4 * PIXELS]
+
+
+@kernel
+def copy_tile(x0: int, y0: int, size: tuple, depths: tuple, source: tuple, images: tuple) -> None:
+    """Copy a tile, of which `size` columns and rows are inside, from one frame's images into another's."""
+    columns, rows = size
+    for row in range(y0, y0 + rows):
+        for column in range(x0, x0 + columns):
+            for channel in range(3):
+                images[0][row, column, channel] = source[0][row, column, channel]
+            images[1][row, column] = source[1][row, column]
+            if len(depths) > 0:
+                images[2][row, column] = source[2][row, column]
