@@ -86,7 +86,8 @@ def _service(settings: "Settings", cores: int) -> Any:
     from msdgs_serve.renderer import Renderer
 
     os.environ[THREADS_VARIABLE] = str(cores)
-    app = create_app(settings.open_store(), Renderer(settings.cache_megabytes << 20), settings)
+    renderer = Renderer(settings.cache_megabytes << 20, settings.sequence_megabytes << 20)
+    app = create_app(settings.open_store(), renderer, settings)
     service, begin = app.state.service, app.router.lifespan_context
 
     @asynccontextmanager

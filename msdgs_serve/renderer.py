@@ -11,11 +11,13 @@ from msdgs_serve.pose_cache import PoseCache
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions, as_trained, rasterize
 from msdgs_serve.render_job import RenderJob
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput, Region
+from msdgs_serve.sequence_cache import FixedView, SequenceCache
 
 Color = tuple[float, float, float]
 Background = Color | Literal["scene", "transparent"]
 
 DEFAULT_CACHE_BYTES = 256 << 20
+DEFAULT_SEQUENCE_BYTES = 128 << 20
 
 
 @dataclass(frozen=True)
@@ -56,13 +58,15 @@ DEFAULT_OPTIONS = RenderOptions()
 
 
 class Renderer:
-    """Renders scenes and caches posed Gaussians. Safe to use from several threads.
+    """Renders scenes, caches posed Gaussians, and for cameras that stand still what doesn't move. Safe to use from
+    several threads.
 
     Concurrent requests for the same scene and time pose its Gaussians once.
     """
 
-    def __init__(self, cache_bytes: int = DEFAULT_CACHE_BYTES) -> None:
+    def __init__(self, cache_bytes: int = DEFAULT_CACHE_BYTES, sequence_bytes: int = DEFAULT_SEQUENCE_BYTES) -> None:
         self.cache = PoseCache(cache_bytes)
+        self.sequences = SequenceCache(sequence_bytes)
 
     def render(
         self,
@@ -112,17 +116,22 @@ class Renderer:
             place = session.scene.metadata.scene_to_world
             seen_from = place.camera_to_scene(camera)
             extra = None if later is None else displacements(gaussians, later, seen_from)
-            drawn = rasterize(
-                gaussians,
-                seen_from,
-                background=background,
-                depth=options.depth,
-                extra=extra,
-                counts=options.counts,
-                options=constants,
-                region=options.region,
-                static=session.scene.static_bounds,
-            )
+            drawn = None
+            if extra is None and not options.counts:
+                view = FixedView(seen_from, background, options.depth, constants, options.region)
+                drawn = self.sequences.frame(session, gaussians, view)
+            if drawn is None:
+                drawn = rasterize(
+                    gaussians,
+                    seen_from,
+                    background=background,
+                    depth=options.depth,
+                    extra=extra,
+                    counts=options.counts,
+                    options=constants,
+                    region=options.region,
+                    static=session.scene.static_bounds,
+                )
             transparent = options.background == "transparent"
             motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]
             counts = drawn.counts if options.counts else None

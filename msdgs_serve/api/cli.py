@@ -88,7 +88,7 @@ def _compile() -> int:
 
 def _serve(settings: Settings) -> None:
     sys.setswitchinterval(SWITCH_SECONDS)
-    store, renderer = settings.open_store(), Renderer(settings.cache_megabytes << 20)
+    store, renderer = settings.open_store(), Renderer(settings.cache_megabytes << 20, settings.sequence_megabytes << 20)
     app = create_app(store, renderer, settings)
     with bind(settings.host, settings.port) as listener:
         print("Loading scenes; the first start compiles kernels, which takes up to a minute …", flush=True)

@@ -61,7 +61,7 @@ class Service:
         )
         self.uploads = Uploads(store.folder, settings)
         self.reading = anyio.CapacityLimiter(READ_AT_ONCE)
-        self.metrics = Metrics(store, renderer.cache, self.queue)
+        self.metrics = Metrics(store, renderer, self.queue)
         self.phase = Phase.STARTING
         self.failure: MsdgsError | None = None
         self.start_seconds = 0.0

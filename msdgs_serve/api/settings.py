@@ -37,6 +37,9 @@ class CommonSettings(BaseModel):
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen on; 0 for a free one.")
     threads: int | None = Field(default=None, ge=1, le=256, description="Render threads; by default one per core.")
     cache_megabytes: int = Field(default=256, ge=0, description="Memory of the cache of posed Gaussians.")
+    sequence_megabytes: int = Field(
+        default=128, ge=0, description="Memory of what stands still before cameras that are asked for repeatedly."
+    )
     scenes_memory_megabytes: int = Field(
         default=2048, ge=1, description="Memory of all loaded scenes; those not requested for longest are unloaded."
     )

@@ -7,7 +7,7 @@ from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.rasterize import MAX_PAIRS, Rendering, checked_background
 from msdgs_serve.rasterizer.simd.types import NUM_LANES
-from msdgs_serve.rasterizer.splats import DEPTH, Splats, empty_records
+from msdgs_serve.rasterizer.splats import DEPTH, RECORD, Splats, empty_records
 from msdgs_serve.rasterizer.tiles import TileLists, bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions, in_tiles
 from msdgs_serve.scene.camera import Camera
@@ -54,6 +54,11 @@ class FrameSequence:
         self._records[first:] = splats.records
         self._depths = _depths_of(splats, lists)
         self._lists = lists._replace(splat_ids=lists.splat_ids + np.uint32(first))
+
+    @staticmethod
+    def least_bytes(count: int, pixels: int, dtype: np.dtype) -> int:
+        """Return a lower bound of the memory of a sequence of `count` Gaussians."""
+        return (count * RECORD + 4 * pixels) * dtype.itemsize
 
     @property
     def nbytes(self) -> int:

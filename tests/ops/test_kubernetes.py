@@ -9,7 +9,7 @@ import yaml
 from msdgs_serve.api.metrics import Metrics
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.work import WorkQueue
-from msdgs_serve.pose_cache import PoseCache
+from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 from tests.support.processes import ROOT
 
@@ -70,7 +70,7 @@ def test_the_services_settings_are_known():
 def test_the_autoscaler_reads_a_metric_of_the_service():
     (metric,) = found("HorizontalPodAutoscaler", "msdgs-render")["spec"]["metrics"]
     name = metric["pods"]["metric"]["name"]
-    page = Metrics(SceneStore([]), PoseCache(0), WorkQueue(1, 1, 1.0)).page().decode()
+    page = Metrics(SceneStore([]), Renderer(0), WorkQueue(1, 1, 1.0)).page().decode()
     assert f"\n{name} " in page
     (rule,) = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text())["rules"]["custom"]
     assert rule["name"]["matches"] == name
