@@ -18,8 +18,9 @@ HTTP_TESTS := tests/service tests/frames/test_video.py --ignore-glob='*/test_vie
 FUZZERS := tests/service/test_openapi.py tests/service/test_hostile_uploads.py tests/scene/test_structured_fuzz.py \
 	tests/export/test_importers_damaged.py tests/export/test_work_precision.py tests/frames/test_blocks.py \
 	tests/rasterizer/test_rasterizer_stress.py
-BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.avx512 service.scaling \
-	training.training_step training.known_motion training.k_steps training.realistic paper export.imported_formats \
+BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.parts rasterizer.still_camera \
+	rasterizer.avx512 service.scaling training.training_step training.known_motion training.k_steps \
+	training.realistic paper export.imported_formats \
 	export.paper_sized export.nodes export.scene_file capture.capture_truth browser
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package

@@ -132,6 +132,8 @@ def _composite_tiles(
     touching = np.empty(BLOCKS, np.uint64)
     height, width = frame.alpha.shape
     pixels = (frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1))
+    before = still.frame
+    drawn_before = (before.rgb.reshape(-1), before.alpha.reshape(-1), before.depth.reshape(-1))
     flat, last = records.reshape(-1), np.uint64(max(len(tiles.splat_ids), 1) - 1)
     while True:
         first = fetch_add(counters, TAKEN, TILES_PER_TURN)
@@ -141,8 +143,7 @@ def _composite_tiles(
         for tile in range(first, end_of_turn):
             x0, y0 = TILE * (tile % tiles.columns), TILE * (tile // tiles.columns)
             if len(still.redrawn) > 0 and still.redrawn[tile] == 0:
-                size = (min(TILE, width - x0), min(TILE, height - y0))
-                copy_tile(x0, y0, size, depths, (still.frame.rgb, still.frame.alpha, still.frame.depth), frame)
+                copy_tile(width, x0, y0, (min(TILE, width - x0), min(TILE, height - y0)), depths, drawn_before, pixels)
                 continue
             prefetch_tile(width, x0, y0, min(TILE, height - y0), depths, pixels)
             clear_tile(state, depths)

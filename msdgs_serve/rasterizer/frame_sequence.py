@@ -49,6 +49,8 @@ class FrameSequence:
         splats, lists = self._binned(static)
         size = self._area.width, self._area.height
         self._still = composite(splats, lists, *size, self._background, options, depth=depth)
+        self.touched = 0.0
+        """Fraction of tiles that the last frame has drawn again."""
         first = -(-moving_count // NUM_LANES) * NUM_LANES
         self._records = empty_records(first + len(static), static.means.dtype)
         self._records[first:] = splats.records
@@ -79,6 +81,7 @@ class FrameSequence:
         self._records[: len(moving)] = splats.records
         depths, counts = _depths_of(splats, lists), np.diff(lists.offsets)
         touched = counts > 0
+        self.touched = float(touched.mean())
         counts[touched] += np.diff(self._lists.offsets)[touched]
         offsets = np.concatenate([[0], np.cumsum(counts)])
         merged = lists._replace(offsets=offsets, splat_ids=np.empty(offsets[-1], np.uint32))

@@ -95,13 +95,15 @@ def write_cut_tile(
 
 
 @kernel
-def copy_tile(x0: int, y0: int, size: tuple, depths: tuple, source: tuple, images: tuple) -> None:
-    """Copy a tile, of which `size` columns and rows are inside, from one frame's images into another's."""
+def copy_tile(width: int, x0: int, y0: int, size: tuple, depths: tuple, source: tuple, pixels: tuple) -> None:
+    """Copy a tile, of which `size` columns and rows are inside, between the flattened images of two frames."""
     columns, rows = size
-    for row in range(y0, y0 + rows):
-        for column in range(x0, x0 + columns):
-            for channel in range(3):
-                images[0][row, column, channel] = source[0][row, column, channel]
-            images[1][row, column] = source[1][row, column]
-            if len(depths) > 0:
-                images[2][row, column] = source[2][row, column]
+    for row in range(rows):
+        start = np.uint64((y0 + row) * width + x0)
+        for place in range(np.uint64(3) * start, np.uint64(3) * (start + np.uint64(columns))):
+            pixels[0][place] = source[0][place]
+        for place in range(start, start + np.uint64(columns)):
+            pixels[1][place] = source[1][place]
+        if len(depths) > 0:
+            for place in range(start, start + np.uint64(columns)):
+                pixels[2][place] = source[2][place]

@@ -12,9 +12,14 @@ import numpy as np
 import pytest
 
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.imaging import FORMATS
+from msdgs_serve.imaging import FORMATS, Channel
+from msdgs_serve.imaging.encode import numbers
+from msdgs_serve.renderer import Renderer, RenderOptions
+from msdgs_serve.scene import Camera, Region
+from msdgs_serve.scene.camera import orbit
+from tests.support.fuzzing import CASES, SEED
 from tests.support.images import decode, linear_to_srgb
-from tests.support.scene_files import level_camera, metadata, write_scene
+from tests.support.scene_files import UP, level_camera, metadata, write_scene
 from tests.support.scenes import draw
 from tests.support.service import ORBIT, check_problem, eventually, serving
 
@@ -253,3 +258,30 @@ def test_pages_about_the_calls_need_nothing_from_elsewhere(client: httpx.Client)
         for source in sources:
             assert source.startswith("/"), source
             assert client.get(client.base_url.copy_with(path=source)).status_code == 200, source
+
+
+@pytest.mark.slow
+def test_frames_of_any_sequence_of_requests_are_those_of_a_fresh_service(tmp_path: Path):
+    """Repeated cameras at other times, sizes, regions, channels and backgrounds, and files that change in between."""
+    path = write_scene(tmp_path / "balls.onnx")
+    plain = Renderer(cache_bytes=0, sequence_bytes=0)
+    with serving(path) as client:
+        for seed in range(SEED, SEED + CASES):
+            random = np.random.default_rng(seed)
+            if seed % 5 == 0:
+                write_scene(path, static_color=tuple(random.uniform(size=3).round(2).tolist()))
+            session = DeformationSession(path)
+            eventually(lambda s=session: client.get("/scenes/balls").json()["sha256"] == s.sha256)
+            for _ in range(8):
+                size, azimuth = int(random.choice([24, 40])), int(random.choice([0, 35]))
+                t, depth = round(random.uniform(), 3), bool(random.integers(2))
+                region = [None, (3, 5, 16, 19)][int(random.integers(2))]
+                background = [None, (0.1, 0.2, 0.3)][int(random.integers(2))]
+                body = {"camera": {**LEVEL, "azimuth": azimuth}, "t": t, "width": size, "height": size, "format": "npy"}
+                channels: list[Channel] = ["rgb", "alpha", "depth"] if depth else ["rgb", "alpha"]
+                got = render(client, **body, channels=channels, background=background, region=region)
+                camera = Camera.from_fov(orbit(np.zeros(3), 5.0, azimuth, 0, UP), size, size, 40.0)
+                options = RenderOptions(background or "transparent", depth=depth, region=region and Region(*region))
+                image = plain.render(session, camera, t, options)
+                np.testing.assert_array_equal(got, numbers(image, channels))
+        assert client.get("/metrics").text.count('msdgs_sequence_cache_frames_total{drawn="moving"} 0.0') == 0
