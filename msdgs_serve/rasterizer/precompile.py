@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numba.core import config
 
+from msdgs_serve.rasterizer.frame_sequence import FrameSequence
 from msdgs_serve.rasterizer.jit import RASTERIZER
 from msdgs_serve.rasterizer.kernel_files import is_writable
 from msdgs_serve.rasterizer.rasterize import rasterize
@@ -13,6 +14,7 @@ from msdgs_serve.rasterizer.tiles import SPLATS_PER_PART
 from msdgs_serve.scene.camera import Camera, look_at
 from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.static_bounds import static_bounds
 
 SIZE = 32
 """Pixels along a side of the image: several tiles."""
@@ -40,8 +42,11 @@ def compile_kernels() -> Path:
     pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
     for count in COUNTS:
         camera = Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose)
+        gaussians = _gaussians(count)
+        static = static_bounds(0, gaussians.means, gaussians.scales)
         for more in (False, True):
-            rasterize(_gaussians(count), camera, depth=more, counts=more)
+            rasterize(gaussians, camera, depth=more, counts=more, static=static)
+            FrameSequence(gaussians, count, camera, depth=more).frame(gaussians)
     return folder
 
 

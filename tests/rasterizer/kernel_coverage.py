@@ -18,10 +18,17 @@ from coverage import Coverage
 from tests.support.processes import ROOT
 from tests.support.tolerances import tolerance
 
-FILES = ("test_vectors.py", "test_rasterizer_oracle.py", "test_rasterizer_gsplat.py", "test_gradients.py")
+FILES = (
+    "test_vectors.py",
+    "test_rasterizer_oracle.py",
+    "test_rasterizer_gsplat.py",
+    "test_gradients.py",
+    "test_frame_sequence.py",
+    "test_culling.py",
+)
 NAMES = (
     "operations or memory or powers or behind or opacity or 6-1-53 or 12-15-53 or harmonics or none_and or camera "
-    "or 40-21-20 or folds"
+    "or 40-21-20 or folds or equal_depths or few_blocks"
 )
 """The tests that are small enough for plain Python."""
 

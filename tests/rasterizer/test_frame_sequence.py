@@ -57,6 +57,7 @@ def test_frames_are_those_of_all_gaussians(
 
 def test_of_equal_depths_the_moving_gaussian_is_in_front():
     moving, static, camera = parts(31, 40, 20)
+    camera = camera.resized(37, 33)
     static = replace(moving, sh=static.sh)
     sequence = FrameSequence(static, len(moving), camera)
     assert_identical(sequence.frame(moving), rasterize(joined(moving, static), camera))

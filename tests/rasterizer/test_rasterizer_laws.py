@@ -7,14 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, Rendering, rasterize
-from msdgs_serve.rasterizer.culling import seen_blocks
+from msdgs_serve.rasterizer import GSPLAT, INRIA, Rendering, rasterize
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.tiles import SPLATS_PER_PART, TooManyPairs, bin_into_tiles
-from msdgs_serve.rasterizer.view import view_of
 from msdgs_serve.scene import Camera, Gaussians, InvalidInput, Region
 from msdgs_serve.scene.quaternion import from_matrix, to_matrix
-from msdgs_serve.scene.static_bounds import static_bounds
 from tests.support import reference
 from tests.support.scenes import as_dtype, draw, front_camera, gaussians_of, joined, random_scene, select, unit_quats
 from tests.support.tolerances import assert_close
@@ -238,29 +235,6 @@ def test_a_region_outside_of_the_image_is_refused(region: tuple[Any, ...]):
     gaussians, camera = scene(20, np.float32)
     with pytest.raises(InvalidInput, match="region"):
         rasterize(gaussians, camera.resized(64, 48), region=Region(*region))
-
-
-@DTYPES
-@pytest.mark.parametrize("moving_count", [0, 300])
-@pytest.mark.parametrize("options", [GSPLAT, INRIA._replace(mip=True)], ids=["gsplat", "inria"])
-def test_blocks_that_are_not_seen_change_nothing(options: RasterizerOptions, moving_count: int, dtype: type):
-    """From outside and inside, by all models of cameras, of Gaussians in the order of space."""
-    gaussians, camera = scene(20, dtype, 3_000)
-    gaussians = select(gaussians, np.lexsort(np.floor(gaussians.means * 2).T))
-    static = static_bounds(moving_count, gaussians.means[moving_count:], gaussians.scales[moving_count:])
-    random, left_out = np.random.default_rng(1), 0
-    for k in range(12):
-        pose = np.eye(4)
-        pose[:3, :3] = to_matrix(unit_quats(random, 1))[0]
-        pose[:3, 3] = random.normal(scale=(0.3, 2, 6)[k % 3], size=3)
-        model = ("pinhole", "orthographic", "fisheye")[k % 5 % 3]
-        view = replace(camera, camera_to_world=pose, model=model, cx=camera.cx + random.normal(scale=20))
-        region = (None, Region(17, 3, 14, 20))[k % 2]
-        channels = {"region": region, "options": options, "depth": True}
-        whole = rasterize(gaussians, view, **channels)
-        assert_identical(rasterize(gaussians, view, static=static, **channels), whole)
-        left_out += int((seen_blocks(static, view_of(view, options), len(gaussians)) == 0).sum())
-    assert left_out > 12, "at least one a view on average"
 
 
 @pytest.mark.parametrize("count", [10, SPLATS_PER_PART])
