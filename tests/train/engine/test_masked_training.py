@@ -18,7 +18,7 @@ from msdgs_train.evaluation.evaluate import scores
 from msdgs_train.evaluation.metrics import MAX_PSNR, image_metrics, masked_psnr, psnr
 from msdgs_train.evaluation.perceptual import PerceptualMetrics
 from msdgs_train.losses.photometric import photometric_loss, ssim
-from msdgs_train.systems.base import Target, ViewLoss
+from msdgs_train.systems.base import Moment, Target, ViewLoss
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import FEW, SIZE, small_config, splatting, trained, write_scene
 
@@ -155,9 +155,9 @@ def test_the_trainer_gives_masks_to_the_loss_and_to_the_metrics(tmp_path: Path, 
     assert evaluated.metrics.psnr == pytest.approx(psnr(evaluated.rgb[shown], evaluated.target[shown]))
     of_frame = trainer.system.loss
 
-    def noted(frame: Frame, target: Target, background: torch.Tensor, step: int) -> ViewLoss:
+    def noted(frame: Frame, target: Target, background: torch.Tensor, moment: Moment) -> ViewLoss:
         targets.append(target)
-        return of_frame(frame, target, background, step)
+        return of_frame(frame, target, background, moment)
 
     monkeypatch.setattr(trainer.system, "loss", noted)
     trainer.step()
