@@ -61,7 +61,8 @@ def test_frames_are_arrays_as_drawn(client: Client, scene: Path):
 def test_a_region_of_a_frame(client: Client):
     whole = client.render(LEVEL, 0.3, width=SIZE, height=SIZE)
     part = client.render(LEVEL, 0.3, width=SIZE, height=SIZE, region=(5, 7, np.int64(20), 9))
-    assert part.rgb is not None and whole.rgb is not None
+    assert part.rgb is not None
+    assert whole.rgb is not None
     np.testing.assert_array_equal(part.rgb, whole.rgb[7:16, 5:25])
 
 
