@@ -11,14 +11,13 @@ from msdgs_serve import __version__
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.baked import CONTRACT, BakedScene, SceneCamera, SceneMetadata
 from msdgs_serve.scene.gaussians import FloatArray
-from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model import DynamicGaussians, canonical_points
 from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.gaussians.raw_quaternions import QuatSpace
 from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import DeformationLayer
-from msdgs_train.layers.quaternions import unit_or_identity
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.gaussians import GaussiansConfig
 
@@ -37,6 +36,7 @@ class Moving:
     means: FloatArray  # [M, 3]
     log_scales: FloatArray  # [M, 3]
     quats: FloatArray  # [M, 4] wxyz, unit
+    raw_quats: FloatArray  # [M, 4] wxyz, of any norm
     modulation: dict[str, FloatArray] = field(default_factory=dict)
     """By head: factors of its deltas (equation 12), [M, 3] or [M, 4]."""
     appearance: dict[str, FloatArray] = field(default_factory=dict)
@@ -47,8 +47,8 @@ class Moving:
     @classmethod
     def none(cls) -> "Moving":
         """No Gaussians."""
-        three = np.empty((0, 3), np.float32)
-        return cls(three, three, np.empty((0, 4), np.float32))
+        three, four = np.empty((0, 3), np.float32), np.empty((0, 4), np.float32)
+        return cls(three, three, four, four)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -91,17 +91,19 @@ def bake(model: DynamicGaussians, info: SceneInfo, checkpoint_sha256: str) -> Ba
 
 def _moving(model: DynamicGaussians) -> Moving:
     g = model.gaussians
+    points = canonical_points(g.rows())
     stored = {name: values for name, values in g.attributes.items() if name != EMBEDDINGS}
     factors = {} if model.modulation is None else model.modulation(g.attributes[EMBEDDINGS])
     appearance = {"opacities": g.raw_opacities[:, None], "sh": torch.cat([g.sh_dc, g.sh_rest], dim=1)}
     return Moving(
         to_numpy(g.means),
         to_numpy(g.log_scales),
-        to_numpy(unit_or_identity(g.raw_quats)),
+        to_numpy(points.quats),
+        to_numpy(points.raw_quats),
         {head: to_numpy(values) for head, values in factors.items()},
         {name: to_numpy(appearance[name]) for name in changing_outputs(model)},
         {name: to_array(values) for name, values in stored.items()},
-        model.support.baked(stored),
+        model.support.baked(points),
     )
 
 

@@ -31,7 +31,7 @@ def polynomial_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     static = (three, np.empty((0, 4), np.float32), three)
     scene = BakedScene(replace(metadata, plan=PLAN), len(g), *static, *appearance, changing=CHANGING)
     scene.validate("the imported scene")
-    baked = Baked(scene, Moving(g.means, g.scales, g.quats), ())
+    baked = Baked(scene, Moving(g.means, g.scales, g.quats, g.quats), ())
     graph = new_graph(baked)
     since = graph.node("Sub", ["t", graph.constant("motion.center", motion.center)], "motion.since")  # [N, 1]
 

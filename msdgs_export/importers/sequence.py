@@ -198,7 +198,8 @@ def _blended(sequence: Frames, sha256: str, place: Similarity) -> onnx.ModelProt
     poses = np.stack([_columns(f, changing)[moving] for f in frames], axis=1)
     give_one_sign(poses)
     control = np.einsum("nt,mtc->mnc", _through(count).astype(np.float32), poses)
-    baked = Baked(scene, Moving(first.means[moving], first.scales[moving], first.quats[moving]), ())
+    quats = first.quats[moving]
+    baked = Baked(scene, Moving(first.means[moving], first.scales[moving], quats, quats), ())
     graph = new_graph(baked)
     posed = of_ids(graph, GriddedPoses(((np.arange(len(control)), StoredPoses.of(control)),)), metadata.time_range)
     if changing:
@@ -245,7 +246,7 @@ def _switched(sequence: Frames, sha256: str, place: Similarity) -> onnx.ModelPro
     scene = BakedScene(
         replace(metadata, plan=plan), len(means), empty, np.empty((0, 4), np.float32), empty, opacities, sh
     ).validate("the imported sequence")
-    baked = Baked(scene, Moving(means, scales, quats), ())
+    baked = Baked(scene, Moving(means, scales, quats, quats), ())
     graph = new_graph(baked)
     low, high = np.array(metadata.bounds)
     parked = (low + high) / 2 - PARKED_AT * max(half_diagonal(metadata.bounds), 1e-3) * (

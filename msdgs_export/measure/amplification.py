@@ -6,7 +6,9 @@ batch are independent, so three backward passes through a layer give it exactly 
 and rotations, which displace the Gaussians that follow a node, are sums over layers: ten more passes give theirs.
 """
 
+import itertools
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +18,7 @@ from torch.nn.functional import pad
 
 from msdgs_train.gaussians.model import DynamicGaussians, canonical_points
 from msdgs_train.layers.base import DeformationLayer
-from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 
 UNIT_ROUNDOFF = 2.0**-24
 """Largest relative error of one rounding to float32."""
@@ -38,7 +40,7 @@ class PointGrowth(NamedTuple):
 
     after: list[Tensor]  # K of [P], as of `Growth`
     amplification: Tensor  # [P]
-    errors: Tensor  # [P, 1] bound of the error of x_K in float32; or [P, 3] also of the sums of wΔS and of wΔR
+    errors: Tensor  # [P, 1] bound of the error of x_K in float32; or also of the sums of wΔS, wΔR and extra heads
 
 
 def growth(double: DynamicGaussians, single: DynamicGaussians, ids: Tensor, t: float) -> Growth:
@@ -50,29 +52,40 @@ def growth(double: DynamicGaussians, single: DynamicGaussians, ids: Tensor, t: f
     points = canonical_points(double.gaussians.rows(ids))
     support, on_nodes = double.support, double.support.num_points is not None
     start = support.points(points.means)
-    found = through_layers(double.deformation, single.deformation, start, t, all_deltas=on_nodes)
+    parts = _summed_parts(double.config.support.extra_heads) if on_nodes else (MEANS,)
+    found = through_layers(double.deformation, single.deformation, start, t, parts)
     predicted = found.errors[:, 0]
     with torch.no_grad():
         if on_nodes:
             deltas = double.deformation(start, torch.tensor(t, dtype=start.dtype))
             predicted = support.mean_error_bounds(found.errors, deltas, points)
             predicted += _following_error(double, single, ids, t)
-        after = [support.spread(values, points.attributes).numpy() for values in found.after]
-        amplification = support.spread(found.amplification, points.attributes).numpy()
+        after = [support.spread(values, points).numpy() for values in found.after]
+        amplification = support.spread(found.amplification, points).numpy()
     predicted = torch.nan_to_num(predicted, nan=math.inf, posinf=math.inf).numpy()
     return Growth(np.array(after).reshape(-1, len(ids)), amplification, predicted)
 
 
+def _summed_parts(extra_heads: Mapping[str, int]) -> tuple[slice, ...]:
+    """Columns of the sums over layers: of means, scales, quaternions and each extra head."""
+    ends = itertools.accumulate(extra_heads.values(), initial=QUATS.stop)
+    return (MEANS, SCALES, QUATS, *itertools.starmap(slice, itertools.pairwise(ends)))
+
+
 def through_layers(
-    double: MultiStepDeformation, single: MultiStepDeformation, means: Tensor, t: float, *, all_deltas: bool
+    double: MultiStepDeformation,
+    single: MultiStepDeformation,
+    means: Tensor,
+    t: float,
+    parts: tuple[slice, ...] = (MEANS,),
 ) -> PointGrowth:
     """Follow float64 `means`, [P, 3], through the layers at time `t`; `single` are the same layers in float32.
 
     δ_k is the error of layer k alone, measured from the same float32 means in both precisions, and u‖x_k‖ the error of
     rounding its results. To first order Σ_k ‖J_K … J_{k+1}‖ · (δ_k + u‖x_k‖) bounds the error of the whole chain. The
-    sums of wΔS and wΔR, with `all_deltas`, have own errors, and others because the layers read inexact positions.
+    sums of other deltas, of the `parts` of their columns, have own errors, and others because the layers read inexact
+    positions.
     """
-    parts = (MEANS, SCALES, QUATS) if all_deltas else (MEANS,)
     sums = pad(means.detach(), (0, parts[-1].stop - 3))
     jacobians, own_errors = [], []
     for layer, rounded in zip(double, single, strict=True):
@@ -105,10 +118,10 @@ def spectral_norm(matrices: Tensor) -> Tensor:
 
 
 def _moved(layer: DeformationLayer, sums: Tensor, t: float) -> Tensor:
-    """Sums over the layers before, [P, 3 or 13], plus those of this layer."""
+    """Sums over the layers before, [P, 3], or of all deltas side by side, plus those of this layer."""
     step = layer(sums[:, MEANS], torch.tensor(t, dtype=sums.dtype))
     scales = pad(step.delta_scales, (0, 6 - step.delta_scales.shape[1]))
-    deltas = torch.cat([step.delta_means, scales, step.delta_quats], dim=1)
+    deltas = torch.cat([step.delta_means, scales, step.delta_quats, *step.extra.values()], dim=1)
     return torch.addcmul(sums, step.weight, deltas[:, : sums.shape[1]])
 
 
@@ -132,7 +145,7 @@ def _own_error(layer: DeformationLayer, rounded: DeformationLayer, sums: Tensor,
 def _following_error(double: DynamicGaussians, single: DynamicGaussians, ids: Tensor, t: float) -> Tensor:
     """[M] errors of float32 means that follow the same float32 deltas of the nodes in both precisions."""
     deltas = single.deformation(single.support.points(single.gaussians.means), torch.tensor(t))
-    exact = deltas._replace(means=deltas.means.double(), scales=deltas.scales.double(), quats=deltas.quats.double())
+    exact = Deltas(*(values.double() for values in deltas[:3]), extra={n: v.double() for n, v in deltas.extra.items()})
     moved = []
     for model, rounded in ((single, deltas), (double, exact)):
         points = canonical_points(model.gaussians.rows(ids))

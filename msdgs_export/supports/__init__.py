@@ -7,11 +7,12 @@ from msdgs_export.layers.base import ModelNotExportable
 from msdgs_export.supports.base import Layout, SupportExport, SupportInputs
 from msdgs_export.supports.gaussians import GaussiansExport
 from msdgs_export.supports.nodes import NodesExport
+from msdgs_export.supports.scgs import SCGSExport
 from msdgs_train.supports.base import Support
 
 __all__ = ["SUPPORTS", "Layout", "SupportExport", "SupportInputs", "support_export_of"]
 
-SUPPORTS: dict[str, SupportExport] = {"gaussians": GaussiansExport(), "nodes": NodesExport()}
+SUPPORTS: dict[str, SupportExport] = {"gaussians": GaussiansExport(), "nodes": NodesExport(), "scgs": SCGSExport()}
 """By the attribute `kind` of a support."""
 
 

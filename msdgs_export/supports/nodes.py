@@ -51,31 +51,45 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     nodes = graph.constant("nodes", positions)
     parts = summed_deltas(graph, inputs.layers, nodes, inputs.time, inputs.steps, list(HEADS), len(positions))
     raw = graph.node("Add", [parts["quats"], graph.constant("nodes.identity", IDENTITY)], "nodes.raw_rots")
-    rots = _unit(graph, "nodes.rots", raw)
-    matrices = _stretching(graph, "nodes.matrices", _matrices(graph, "nodes.rotations", rots), parts["scales"])
+    rots = unit_rows(graph, "nodes.rots", raw)
+    matrices = _stretching(graph, "nodes.matrices", rotation_columns(graph, "nodes.rotations", rots), parts["scales"])
+    offsets = node_offsets(graph, nodes, parts["means"], matrices)
+    return graph.node("Concat", [matrices, offsets, rots], "nodes.motions", axis=1)
+
+
+def node_offsets(graph: GraphBuilder, nodes: str, translations: str, matrices: str) -> str:
+    """[M, 3] offsets of motions that take nodes, [M, 3], by these translations, of matrices column by column."""
     columns = graph.constant("nodes.columns", np.repeat(np.arange(3), 3))
     factors = graph.node("Gather", [nodes, columns], "nodes.factors", axis=1)
     add_columns = graph.constant("nodes.add_columns", np.tile(np.eye(3, dtype=np.float32), (3, 1)))
     products = graph.node("Mul", [matrices, factors], "nodes.products")
     rotated = graph.node("MatMul", [products, add_columns], "nodes.rotated")
-    offsets = graph.node("Sub", [graph.node("Add", [nodes, parts["means"]], "nodes.moved"), rotated], "nodes.offsets")
-    return graph.node("Concat", [matrices, offsets, rots], "nodes.motions", axis=1)
+    return graph.node("Sub", [graph.node("Add", [nodes, translations], "nodes.moved"), rotated], "nodes.offsets")
 
 
 def _blend(graph: GraphBuilder, inputs: SupportInputs) -> Blend:
     """Weighted means of the motions of the nodes that each Gaussian follows."""
-    nodes, ids, weights = (inputs.attributes[name] for name in ("nodes", "ids", "weights"))
-    count = ids.shape[0] * ids.shape[1]
-    followed = [_motions(graph, inputs), _stored_ids(graph, "skinning.nodes", nodes)]
-    followed = graph.node("Gather", followed, "skinning.followed")  # [B, U, 16]
-    # [B, S, 16], and transposed: 2.1 ms for 106,500 Gaussians; [B, 16, S], where the larger matrix is on the right, 3.0
-    blended = graph.node("MatMul", [_weights(graph, ids, weights, nodes.shape[1]), followed], "skinning.blended")
-    names = ["skinning.matrices", "skinning.offsets", "skinning.rots"]
-    matrices, offsets, rots = graph.split(columns_of(graph, blended, 16, count), names, [9, 3, 4], axis=0)
-    axes = _matrices(graph, "skinning.axes", inputs.quats)  # constant: computed when the file is opened
+    parts = {"matrices": 9, "offsets": 3, "rots": 4}
+    (matrices, offsets, rots), count = blended_parts(graph, inputs.attributes, _motions(graph, inputs), parts)
+    axes = rotation_columns(graph, "skinning.axes", inputs.quats)  # constant: computed when the file is opened
     sizes = ((inputs.means, 3), (inputs.quats, 4), (axes, 9))
     means, quats, axes = (columns_of(graph, value, width, count) for value, width in sizes)
     return Blend(matrices, offsets, rots, means, quats, axes, count)
+
+
+def blended_parts(
+    graph: GraphBuilder, blocks: Mapping[str, np.ndarray], motions: str, parts: Mapping[str, int]
+) -> tuple[list[str], int]:
+    """Weighted means of motions, [M, C], of the nodes that each of R rows of blocks follows: parts of so many columns,
+    [·, R] each, and R."""
+    nodes, ids, weights = (blocks[name] for name in ("nodes", "ids", "weights"))
+    count, width = ids.shape[0] * ids.shape[1], sum(parts.values())
+    followed = [motions, _stored_ids(graph, "skinning.nodes", nodes)]
+    followed = graph.node("Gather", followed, "skinning.followed")  # [B, U, C]
+    # [B, S, 16], and transposed: 2.1 ms for 106,500 Gaussians; [B, 16, S], where the larger matrix is on the right, 3.0
+    blended = graph.node("MatMul", [_weights(graph, ids, weights, nodes.shape[1]), followed], "skinning.blended")
+    names = [f"skinning.{name}" for name in parts]
+    return graph.split(columns_of(graph, blended, width, count), names, list(parts.values()), axis=0), count
 
 
 def _weights(graph: GraphBuilder, ids: np.ndarray, weights: np.ndarray, width: int) -> str:
@@ -116,7 +130,7 @@ def _stretching(graph: GraphBuilder, name: str, rotations: str, stretches: str) 
     return reshaped(graph, graph.node("MatMul", transposed, f"{name}.product"), (-1, 9), name)
 
 
-def _matrices(graph: GraphBuilder, name: str, quats: str) -> str:
+def rotation_columns(graph: GraphBuilder, name: str, quats: str) -> str:
     """[·, 9] rotation matrices, column by column: products of pairs of w, x, y, z, summed by a constant."""
     first, second, factors = quaternion_products()
     left, right = (
@@ -137,7 +151,7 @@ def quaternion_products() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return first, second, np.where((first == second)[:, None, None], alone[first], both).astype(np.float32)
 
 
-def _unit(graph: GraphBuilder, name: str, quats: str) -> str:
+def unit_rows(graph: GraphBuilder, name: str, quats: str) -> str:
     """Normalize quaternions, [·, 4], as training does."""
     ones = graph.constant(f"{name}.four", np.ones((4, 4), np.float32))
     least = graph.constant(f"{name}.least", np.array(MIN_NORM, np.float32))

@@ -5,6 +5,7 @@ with ones, which take half the time of additions.
 """
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,15 @@ from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
 from msdgs_train.supports.skinning_kernels import MIN_STRETCH
 
 WIDTHS = {"means": 3, "scales": 3, "quats": 4}
+
+
+class Affine(NamedTuple):
+    """The blended matrices and offsets of all Gaussians, and their canonical means, in columns."""
+
+    matrices: str  # [9, R] column by column
+    offsets: str  # [3, R]
+    means: str  # [3, R]
+    count: int  # R
 
 
 class Blend(NamedTuple):
@@ -35,11 +45,11 @@ def skinned_deltas(graph: GraphBuilder, blend: Blend) -> dict[str, str]:
     squares = graph.node("Max", [_squares(graph, blend, blend.axes), minimum], "skinning.clamped")
     logs = [graph.node("Log", [squares], "skinning.logs"), _number(graph, "skinning.half", 0.5)]
     columns = {
-        "means": graph.node("Sub", [_moved(graph, blend), blend.means], "skinning.means.delta"),
+        "means": graph.node("Sub", [moved_means(graph, blend), blend.means], "skinning.means.delta"),
         "scales": graph.node("Mul", logs, "skinning.scales.delta"),
         "quats": graph.node("Sub", [_unit(graph, _rotated(graph, blend)), blend.quats], "skinning.quats.delta"),
     }
-    return {part: _rows(graph, value, WIDTHS[part], blend.count) for part, value in columns.items()}
+    return rows_of(graph, columns, blend.count)
 
 
 def skinned_poses(graph: GraphBuilder, blend: Blend, log_scales: str) -> dict[str, str]:
@@ -52,8 +62,8 @@ def skinned_poses(graph: GraphBuilder, blend: Blend, log_scales: str) -> dict[st
     nearly_zero = graph.constant("skinning.quats.nearly_zero", np.array([[MIN_NORM], [0], [0], [0]], np.float32))
     rotated = graph.node("Add", [_rotated(graph, blend), nearly_zero], "skinning.quats.nonzero")
     limit = math.exp(LOG_SCALE_LIMIT)
-    columns = {"means": _moved(graph, blend), "scales": scales, "quats": _unit(graph, rotated)}
-    poses = {part: _rows(graph, value, WIDTHS[part], blend.count) for part, value in columns.items()}
+    columns = {"means": moved_means(graph, blend), "scales": scales, "quats": _unit(graph, rotated)}
+    poses = rows_of(graph, columns, blend.count)
     return {**poses, "scales": _clipped(graph, poses["scales"], 1 / limit, limit)}
 
 
@@ -69,6 +79,11 @@ def reshaped(graph: GraphBuilder, value: str, shape: tuple[int, ...], output: st
     return graph.node("Reshape", [value, graph.constant(f"{output}.shape", np.array(shape, np.int64))], output)
 
 
+def rows_of(graph: GraphBuilder, columns: Mapping[str, str], count: int) -> dict[str, str]:
+    """[R, C] means, scales and quaternions that lie in columns."""
+    return {part: _rows(graph, value, WIDTHS[part], count) for part, value in columns.items()}
+
+
 def _rows(graph: GraphBuilder, columns: str, width: int, count: int) -> str:
     """[R, C] of values that lie in columns."""
     stack = reshaped(graph, columns, (1, width, count), f"{columns}.stack")
@@ -76,7 +91,7 @@ def _rows(graph: GraphBuilder, columns: str, width: int, count: int) -> str:
     return reshaped(graph, rows, (count, width), f"{columns}.rows")
 
 
-def _moved(graph: GraphBuilder, blend: Blend) -> str:
+def moved_means(graph: GraphBuilder, blend: Affine | Blend) -> str:
     """[3, R] means, moved."""
     turned = _turned(graph, blend, blend.means, "skinning.means.turned")
     return graph.node("Add", [turned, blend.offsets], "skinning.means")
@@ -91,7 +106,7 @@ def _squares(graph: GraphBuilder, blend: Blend, axes: str) -> str:
     return graph.node("Concat", squares, f"{axes}.squares", axis=0)
 
 
-def _turned(graph: GraphBuilder, blend: Blend, vectors: str, output: str) -> str:
+def _turned(graph: GraphBuilder, blend: Affine | Blend, vectors: str, output: str) -> str:
     """[3, R] products of the blended matrices and vectors, [3, R]."""
     columns = reshaped(graph, blend.matrices, (3, 3, blend.count), f"{output}.columns")
     factors = reshaped(graph, vectors, (3, 1, blend.count), f"{output}.factors")

@@ -30,8 +30,8 @@ class ExactPoses:
         self.count = len(m)
         self._space: ScaleSpace = "log" if baked.scene.metadata.delta_space == DELTA_SPACES["log"] else "linear"
         self._is_raw = baked.quat_space == "raw"
-        self._means, self._log_scales, self._quats = (
-            torch.from_numpy(a).double() for a in (m.means, m.log_scales, m.quats)
+        self._means, self._log_scales, self._quats, self._raw_quats = (
+            torch.from_numpy(a).double() for a in (m.means, m.log_scales, m.quats, m.raw_quats)
         )
         self._factors = {head: torch.from_numpy(factors).double() for head, factors in m.modulation.items()}
         self._attributes = {name: torch.from_numpy(values) for name, values in m.attributes.items()}
@@ -49,7 +49,8 @@ class ExactPoses:
         """[M, 10] means, linear scales and unit quaternions of the moving Gaussians `ids`, or of all."""
         rows = torch.from_numpy(np.arange(self.count) if ids is None else ids)
         means, log_scales, quats = self._means[rows], self._log_scales[rows], self._quats[rows]
-        points = CanonicalPoints(means, quats, {name: v[rows] for name, v in self._attributes.items()})
+        attributes = {name: v[rows] for name, v in self._attributes.items()}
+        points = CanonicalPoints(means, quats, attributes, self._raw_quats[rows])
         deltas = self._support(self._deformation, points, torch.tensor(t, dtype=torch.float64))
         of_means, of_scales, of_quats = (
             self._factors[head][rows] * getattr(deltas, head) if head in self._factors else getattr(deltas, head)

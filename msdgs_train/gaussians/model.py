@@ -70,7 +70,7 @@ class DynamicGaussians(nn.Module):
         rest = sh_coefficients(self.config.sh_degree if sh_degree is None else sh_degree) - 1
         sh = torch.cat([g.sh_dc, g.sh_rest if rest == g.sh_rest.shape[1] else g.sh_rest[:, :rest]], dim=1)
         points, raw_opacities = points or canonical_points(g), g.raw_opacities
-        means, quats, _ = points
+        means, quats = points.means, points.quats
         if not (deform and len(self.deformation) and num_layers != 0):
             return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)
         if motions is None:
@@ -113,7 +113,7 @@ class DynamicGaussians(nn.Module):
 
 def canonical_points(rows: GaussianRows) -> CanonicalPoints:
     """What a support reads of these Gaussians."""
-    return CanonicalPoints(rows.means, unit_or_identity(rows.raw_quats), rows.attributes)
+    return CanonicalPoints(rows.means, unit_or_identity(rows.raw_quats), rows.attributes, rows.raw_quats)
 
 
 def _check_shapes(config: ModelConfig, gaussians: CanonicalGaussians) -> None:

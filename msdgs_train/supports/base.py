@@ -22,6 +22,7 @@ class CanonicalPoints(NamedTuple):
     means: Tensor  # [N, 3]
     quats: Tensor  # [N, 4] wxyz, unit
     attributes: dict[str, Tensor]  # the support's own, of N rows
+    raw_quats: Tensor  # [N, 4] wxyz, of any norm
 
 
 @dataclass(frozen=True)
@@ -92,11 +93,11 @@ class Support(nn.Module):
         is on the CPU."""
         return {}
 
-    def baked(self, attributes: dict[str, Tensor]) -> dict[str, Any]:
+    def baked(self, gaussians: CanonicalPoints) -> dict[str, Any]:
         """Arrays [N, …] that a scene file stores per Gaussian, made from the support's attributes."""
         return {}
 
-    def spread(self, values: Tensor, attributes: dict[str, Tensor]) -> Tensor:
+    def spread(self, values: Tensor, gaussians: CanonicalPoints) -> Tensor:
         """Numbers of the points, [P], as numbers of the Gaussians, [N], that follow them."""
         return values
 
@@ -108,7 +109,8 @@ class Support(nn.Module):
         """[N] bounds to first order of the errors of the Gaussians' means, given those of the control nodes' deltas.
 
         Args:
-            errors: [P, 3] norms of the errors of means, of stretch tensors (Frobenius) and of quaternions.
+            errors: [P, 3 + E] norms of the errors of means, of scales or stretch tensors (Frobenius), of quaternions,
+                and of each extra head.
             deltas: Those of the P nodes.
             gaussians: N canonical Gaussians.
         """

@@ -23,6 +23,7 @@ from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.quaternions import rotation_matrices, stretch_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
+from msdgs_train.supports.nearest import farthest_points
 from msdgs_train.supports.skinning import skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MOTION
 
@@ -135,12 +136,9 @@ class NodesSupport(Support):
         opaque = means[opacities > NODE_MIN_OPACITY]
         if len(opaque) < 2 * len(self.nodes):  # too few to choose from
             opaque = means
-        chosen = int((opaque - opaque.mean(dim=0)).norm(dim=1).argmin())
-        distances = opaque.new_full((len(opaque),), torch.inf)
-        for k in range(len(self.nodes)):
-            self.nodes[k] = opaque[chosen]
-            distances = torch.minimum(distances, (opaque - opaque[chosen]).norm(dim=1))
-            chosen = int(distances.argmax())
+        first = int((opaque - opaque.mean(dim=0)).norm(dim=1).argmin())
+        chosen, distances = farthest_points(opaque, len(self.nodes), first)
+        self.nodes.copy_(opaque[chosen])
         near = torch.cdist(self.nodes, self.nodes).topk(self.neighbors.shape[1] + 1, largest=False)
         self.neighbors.copy_(near.indices[:, 1:])
         radius = max(NODE_RADIUS * float(distances.max()), MIN_NODE_RADIUS)
@@ -165,14 +163,14 @@ class NodesSupport(Support):
         lengths = torch.linalg.vector_norm(self.nodes[near] - self.nodes[:, None], dim=2)
         return (torch.linalg.vector_norm(moved - own[near], dim=2) / (lengths + MIN_DISTANCE)).mean()
 
-    def baked(self, attributes: dict[str, Tensor]) -> dict[str, Any]:
+    def baked(self, gaussians: CanonicalPoints) -> dict[str, Any]:
         """`skinning_weights`, [N, F], whose rows sum to 1, and `node_ids`, int64 [N, F]."""
-        weights = skinning_weights(attributes["skinning_logits"])
-        return {"skinning_weights": to_array(weights), "node_ids": to_array(attributes["node_ids"])}
+        weights = skinning_weights(gaussians.attributes["skinning_logits"])
+        return {"skinning_weights": to_array(weights), "node_ids": to_array(gaussians.attributes["node_ids"])}
 
-    def spread(self, values: Tensor, attributes: dict[str, Tensor]) -> Tensor:
-        weights = skinning_weights(attributes["skinning_logits"])
-        return (weights * values[attributes["node_ids"]]).sum(dim=1)
+    def spread(self, values: Tensor, gaussians: CanonicalPoints) -> Tensor:
+        weights = skinning_weights(gaussians.attributes["skinning_logits"])
+        return (weights * values[gaussians.attributes["node_ids"]]).sum(dim=1)
 
     def mean_error_bounds(self, errors: Tensor, deltas: Deltas, gaussians: CanonicalPoints) -> Tensor:
         of_means, of_scales, of_quats = errors.unbind(dim=1)

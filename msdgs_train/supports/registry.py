@@ -3,8 +3,11 @@
 from msdgs_train.supports.base import SupportConfig
 from msdgs_train.supports.gaussians import GaussiansConfig
 from msdgs_train.supports.nodes import NodesConfig
+from msdgs_train.supports.scgs import SCGSConfig
 
-SUPPORTS: dict[str, type[SupportConfig]] = {config.kind: config for config in (GaussiansConfig, NodesConfig)}
+SUPPORTS: dict[str, type[SupportConfig]] = {
+    config.kind: config for config in (GaussiansConfig, NodesConfig, SCGSConfig)
+}
 
 
 def register_support(config: type[SupportConfig]) -> None:

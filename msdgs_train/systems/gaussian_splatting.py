@@ -1,6 +1,5 @@
 """Systems of Gaussians with any support and any chain of layers; published ones differ in their settings."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
 from msdgs_train.gaussians.bounds import first_by_pose, scene_bounds, scene_scale, spread_frames, views_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
+from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians, canonical_points
 from msdgs_train.gaussians.scale_space import count_clamped
 from msdgs_train.gaussians.surgery import RowSurgery
@@ -44,28 +44,45 @@ class GaussianSplatting:
         given = config.data.scene_half_size  # in world units
         self.scene_half_size = given / scene.scene_to_world.scale if given else scene.scene_half_size
         cameras = [frame.camera for frame in scene.splits["train"]]
-        distinct = first_by_pose(cameras, lambda camera: camera)
-        scale, views = scene_scale(cameras) or self.scene_half_size, len(distinct)
-        is_mcmc, is_rig = config.density.density_strategy == "mcmc", 2 * views <= len(cameras)
-        if is_rig and views > 1:
+        self.distinct = first_by_pose(cameras, lambda camera: camera)
+        self.scale, views = scene_scale(cameras) or self.scene_half_size, len(self.distinct)
+        self.is_rig = 2 * views <= len(cameras)
+        if self.is_rig and views > 1:
             config = config.updated(layers=[layer.for_rig(len(cameras) // views) for layer in config.model.layers])
             schedule = schedule._replace(config=config)
         self.several_per_time = 2 * len({frame.t for frame in scene.splits["train"]}) <= len(cameras)
         self.schedule, self.config, self.scene = schedule, config, scene
-        bounds = SceneBounds(self.scene_half_size, scene.time_range)
-        self.model = _new_model(schedule, scene, bounds, distinct).to(config.run.device)
-        most = config.density.bound(max(camera.width * camera.height for camera in cameras))
-        self.density: DensityStrategy = (
-            MCMCStrategy.start(schedule, most)
-            if is_mcmc
-            else GradientStrategy.start(schedule, most, scale, self.size, views, is_rig)
-        )
+        bounds, gaussians = SceneBounds(self.scene_half_size, scene.time_range), self.new_gaussians()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.run.seed)
+            self.model = DynamicGaussians(config.model, gaussians, bounds).to(config.run.device)
+        self.max_gaussians = config.density.bound(max(camera.width * camera.height for camera in cameras))
+        self.density = self.new_density(schedule, self.max_gaussians)
         self.average: WeightAverage[DynamicGaussians] = WeightAverage(schedule.ema_steps)
         self.poses = None
         if config.poses.pose_opt:
             if config.model.quat_space == "raw":
                 raise InvalidInput("config.pose_opt", "off with --quat-space raw, which no camera can turn", True)
             self.poses = PoseRefinement(config.poses, scene.splits["train"]).to(config.run.device)
+
+    def new_gaussians(self) -> CanonicalGaussians:
+        """Those that a run starts with, on the CPU."""
+        config, scene = self.config, self.scene
+        rest = (config.model.sh_degree, config.run.seed, config.model.attributes())
+        count = config.density.init_num_pts
+        if scene.points is not None and len(scene.points):
+            return CanonicalGaussians.from_sparse_points(scene.points, scene.point_colors, count, *rest)
+        least = config.density.init_min_views * len(self.distinct)
+        in_view = (lambda points: views_of(points, self.distinct) >= least) if least else None
+        gray = config.density.init_gray
+        return CanonicalGaussians.random_in_cube(count, self.scene_half_size, *rest, in_view, gray)
+
+    def new_density(self, schedule: Schedule, max_gaussians: int) -> DensityStrategy:
+        """Density control of the present Gaussians from the start of a schedule."""
+        if schedule.config.density.density_strategy == "mcmc":
+            return MCMCStrategy.start(schedule, max_gaussians)
+        views = len(self.distinct)
+        return GradientStrategy.start(schedule, max_gaussians, self.scale, self.size, views, self.is_rig)
 
     @property
     def size(self) -> int:
@@ -161,8 +178,10 @@ class GaussianSplatting:
     def save(self, path: Path, step: int) -> None:
         """Write `model.pt`: the model with time range, background, bounds and cameras."""
         model, info = self.eval_model, self._scene_info(step)
-        as_drawn = replace(model.config, eps2d=self.schedule.eps2d(step))
-        model_file.save_model(path, model, info, step, as_drawn)
+        model_file.save_model(path, model, info, step, self._stored_config(model, step))
+
+    def _stored_config(self, model: DynamicGaussians, step: int) -> ModelConfig:
+        return replace(model.config, eps2d=self.schedule.eps2d(step))
 
     def _scene_info(self, step: int) -> model_file.SceneInfo:
         training = self.scene.splits["train"]
@@ -227,25 +246,6 @@ class GaussianSplatting:
             for layer in self.model.deformation:
                 terms += layer.regularizers(moved, time, moment.generator).values()
         return sum(terms, 0.0)
-
-
-def _new_model(
-    schedule: Schedule, scene: SceneData, bounds: SceneBounds, cameras: Sequence[Camera]
-) -> DynamicGaussians:
-    config, attributes = schedule.config.model, schedule.config.model.attributes()
-    count, seed = schedule.config.density.init_num_pts, schedule.config.run.seed
-    rest = (config.sh_degree, seed, attributes)
-    if scene.points is not None and len(scene.points):
-        gaussians = CanonicalGaussians.from_sparse_points(scene.points, scene.point_colors, count, *rest)
-    else:
-        least = schedule.config.density.init_min_views * len(cameras)
-        in_view = (lambda points: views_of(points, cameras) >= least) if least else None
-        gaussians = CanonicalGaussians.random_in_cube(
-            count, bounds.scene_half_size, *rest, in_view, schedule.config.density.init_gray
-        )
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return DynamicGaussians(config, gaussians, bounds)
 
 
 def _resize(gaussians: nn.Module, state: dict[str, Tensor]) -> None:

@@ -153,7 +153,7 @@ def jacobian_rows() -> Iterator[Row]:
         model = changed(layers=(layer,) * 3).double()
         means = model.gaussians.means.detach()
         single = copy.deepcopy(model.deformation).float()
-        found = through_layers(model.deformation, single, means, 0.3, all_deltas=False)
+        found = through_layers(model.deformation, single, means, 0.3)
         step, columns, t = 1e-7, [], torch.tensor(0.3, dtype=torch.double)
         with torch.no_grad():
             for axis in torch.eye(3, dtype=torch.double) * step:

@@ -55,6 +55,11 @@ TABLE = (
     Row("conic.finite_differences", 1e-7, "central differences with a step of 1e-6: 1e-13 / 1e-6"),
     Row("color.float32", 2e-6, "16 products of size 1, stored as float32"),
     Row("color.float64", 1e-12, "the same in float64"),
+    # SC-GS's own modules, run in float64
+    Row("scgs.pose", 1e-4, "float32 of a network of eight layers and of sums of size 10"),
+    Row("scgs.losses.relative", 1e-3, "five steps amplify roundings of float64; fitted rotations are sums of products"),
+    Row("scgs.rendered", 1e-4, "poses that are 1e-6 off, rounded differently by onnxruntime; colors of size 1"),
+    Row("scgs.fitted", 1e-3, "as scgs.losses: Adam divides by gradients, however small"),
     # gradients, relative to the largest entry of their kind
     Row("gradient.finite_differences", 1e-6, "central differences, step 1e-6: 1e-10 / 1e-3 of the largest entry"),
     Row("gradient.autograd", 1e-9, "the same derivative in another order of operations, float64"),

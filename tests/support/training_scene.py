@@ -103,12 +103,13 @@ def shrunk(config: TrainConfig) -> TrainConfig:
     support = config.model.support
     model = dataclasses.replace(
         config.model,
-        support=dataclasses.replace(support, num_nodes=20) if isinstance(support, NodesConfig) else support,
+        support=dataclasses.replace(support, num_nodes=20) if support.moves_nodes else support,  # type: ignore
         layers=tuple(map(_narrow, config.model.layers[:3])),
         embedding_dim=min(config.model.embedding_dim, 4),
     )
+    static = 0.25 if config.curriculum.static_fraction else 0.0
     return config.updated(
-        model=model, steps=12, static_fraction=0.25, threads=2, init_num_pts=60, max_gaussians=90,
+        model=model, steps=12, static_fraction=static, threads=2, init_num_pts=60, max_gaussians=90,
         refine_start_fraction=4 / 12, refine_every_fraction=4 / 12, sh_degree_fraction=4 / 12,
     )  # fmt: skip
 

@@ -33,6 +33,8 @@ class RunImporter(Protocol):
 
     networks: str
     """Path of the networks in a run folder, with `*` for the number of the iteration. It identifies the format."""
+    marker: str
+    """The name of a tensor that such networks have and others at the same path don't; empty: any are such."""
     white_background: bool
     """Background of runs whose cfg_args don't name one."""
 

@@ -1,5 +1,7 @@
 """Runs of Deformable-3D-Gaussians: one MLP that reads encoded position and time, deltas in activated space."""
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor, nn
 
@@ -27,6 +29,7 @@ class DeformGSImporter:
     """Importer of Deformable-3D-Gaussians."""
 
     networks = "deform/iteration_*/deform.pth"
+    marker = ""
     white_background = False
 
     def read(self, run: RunFolder, gaussians: CanonicalGaussians) -> tuple[DynamicGaussians, list[str]]:
@@ -38,19 +41,20 @@ class DeformGSImporter:
             )
         config = ModelConfig(
             sh_degree=SH_DEGREES[1 + gaussians.sh_rest.shape[1]],
-            layers=(_layer_config(state),),
+            layers=(network_config(state),),
             weights=False,
             embedding_dim=0,
             scale_space="linear",
         )
-        return filled_model(config, gaussians, lambda model: _fill(model, state)), []
+        return filled_model(config, gaussians, lambda model: fill_network(model, state, HEADS)), []
 
     def fidelity(self, model: DynamicGaussians, info: SceneInfo) -> Loss:
         """Its rasterizer doesn't normalize quaternions."""
         return quaternion_fidelity(model, info)
 
 
-def _layer_config(state: State) -> MLPConfig:
+def network_config(state: State) -> MLPConfig:
+    """The sizes of a network. Raises `ImportFailed` for those that no layer can have."""
     depth = sum(name.startswith("linear.") and name.endswith(".weight") for name in state.names())
     if not MIN_LAYERS <= depth <= MAX_LAYERS:
         raise ImportFailed(state.file, f"has {depth} hidden layers; from {MIN_LAYERS} to {MAX_LAYERS} can be read")
@@ -85,8 +89,9 @@ def _time_sizes(state: State, width: int) -> tuple[int, int, int]:
 
 
 @torch.no_grad()
-def _fill(model: DynamicGaussians, state: State) -> None:
-    """Set the layer's parameters. The stored encoding has sine and cosine of a frequency side by side."""
+def fill_network(model: DynamicGaussians, state: State, heads: Mapping[str, int]) -> None:
+    """Set the layer's parameters; `heads` are names and sizes of the stored ones in the layer's order. The stored
+    encoding has sine and cosine of a frequency side by side."""
     layer = model.deformation.layers[0]
     assert isinstance(layer, MLPLayer)
     order = _octave_order(3, XYZ_FREQUENCIES)
@@ -106,8 +111,8 @@ def _fill(model: DynamicGaussians, state: State) -> None:
         state.fill(linear, f"linear.{i}")
         if i in (0, layer.skip):
             linear.weight[:, : len(inputs)] = linear.weight[:, inputs]
-    weights = [state.read(f"{name}.weight", size, layer.heads.in_features) for name, size in HEADS.items()]
-    _set(layer.heads, torch.cat(weights), torch.cat([state.read(f"{n}.bias", size) for n, size in HEADS.items()]))
+    weights = [state.read(f"{name}.weight", size, layer.heads.in_features) for name, size in heads.items()]
+    _set(layer.heads, torch.cat(weights), torch.cat([state.read(f"{n}.bias", size) for n, size in heads.items()]))
 
 
 def _octave_order(dimensions: int, frequencies: int) -> Tensor:

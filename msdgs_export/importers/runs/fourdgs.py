@@ -58,6 +58,7 @@ class FourDGSImporter:
     """Importer of 4DGaussians."""
 
     networks = "point_cloud/iteration_*/deformation.pth"
+    marker = ""
     white_background = True
 
     def read(self, run: RunFolder, gaussians: CanonicalGaussians) -> tuple[DynamicGaussians, list[str]]:

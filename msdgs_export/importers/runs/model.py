@@ -16,7 +16,8 @@ from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.runs.base import RunImporter
 from msdgs_export.importers.runs.deformgs import DeformGSImporter
 from msdgs_export.importers.runs.fourdgs import FourDGSImporter
-from msdgs_export.importers.runs.state import RunFolder
+from msdgs_export.importers.runs.scgs import SCGSImporter
+from msdgs_export.importers.runs.state import RunFolder, stores
 from msdgs_export.importers.scene import metadata_of
 from msdgs_export.importers.splats.base import Splats, as_float32, logit
 from msdgs_export.importers.splats.formats import read_splats, refuse_pointer
@@ -27,8 +28,12 @@ from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, save_model
 
-RUNS: dict[str, RunImporter] = {"deformgs": DeformGSImporter(), "4dgs": FourDGSImporter()}
-"""Importers by name of the format."""
+RUNS: dict[str, RunImporter] = {
+    "scgs": SCGSImporter(),
+    "deformgs": DeformGSImporter(),
+    "4dgs": FourDGSImporter(),
+}
+"""Importers by name of the format; those with a marker come before others with the same path."""
 
 MAX_CAMERAS = 1_000
 CHECKED_TIMES = 3
@@ -37,8 +42,14 @@ BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 def run_format(folder: Path) -> str | None:
     """The format of a run folder, one of `RUNS`; None for other folders."""
-    found = (name for name, importer in RUNS.items() if next(folder.glob(importer.networks), None) is not None)
+    found = (
+        name for name, importer in RUNS.items() if any(_is_of(importer, f) for f in folder.glob(importer.networks))
+    )
     return next(found, None)
+
+
+def _is_of(importer: RunImporter, networks: Path) -> bool:
+    return not importer.marker or stores(networks, importer.marker)
 
 
 def write_model(run: Path, file_format: str, output: Path, console: Console) -> list[dict[str, Any]]:

@@ -1,6 +1,8 @@
 """The networks and settings of another trainer's run, read without running any code in its files."""
 
 import ast
+import copy
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,9 @@ from torch import Tensor, nn
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.guard import read_guarded
 from msdgs_train.gaussians.model_file import CheckpointInvalid, load, refuse_unlike_stored
+
+PICKLE_BYTES = 1 << 24
+"""Of the part of a torch file with its names, which is searched."""
 
 
 class State:
@@ -38,6 +43,18 @@ class State:
             raise ImportFailed(self.file, f"`{name}` has shape {tuple(tensor.shape)}, not {expected}")
         return tensor
 
+    def part(self, prefix: str) -> "State":
+        """The tensors whose names begin with `prefix`, by the rest of their names."""
+        found = copy.copy(self)
+        found._values = {n.removeprefix(prefix): v for n, v in self._values.items() if n.startswith(prefix)}
+        return found
+
+    def with_zeros(self, shapes: Mapping[str, tuple[int, ...]]) -> "State":
+        """These tensors and others that are 0, by name and shape."""
+        found = copy.copy(self)
+        found._values = self._values | {name: torch.zeros(shape) for name, shape in shapes.items()}
+        return found
+
     def fill(self, linear: nn.Module, name: str) -> None:
         """Set weight and bias of a Linear to those stored under `name`."""
         for kind in ("weight", "bias"):
@@ -63,6 +80,16 @@ def read_network(file: Path) -> dict[str, np.ndarray]:
     return {str(name): tensor.detach().to(torch.float32).numpy() for name, tensor in values.items()}
 
 
+def stores(file: Path, name: str) -> bool:
+    """Whether a torch file has this text among the names of what it stores; nothing is unpickled."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            parts = [part for part in archive.namelist() if part.endswith("/data.pkl")]
+            return any(name.encode() in archive.open(part).read(PICKLE_BYTES) for part in parts)
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, ValueError):
+        return False  # for the reader to name
+
+
 class RunFolder:
     """One iteration of a run: its networks and the plain values of its cfg_args."""
 
@@ -72,6 +99,7 @@ class RunFolder:
         if not (folder / name).is_file():
             raise ImportFailed(folder, f"has point_cloud/iteration_{iteration} but no {name}")
         self.state = State(folder / name)
+        self.cloud = folder / f"point_cloud/iteration_{iteration}/point_cloud.ply"
         self.settings = _settings(folder / "cfg_args")
 
 

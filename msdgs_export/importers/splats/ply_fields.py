@@ -43,6 +43,7 @@ PLY = FieldTable(
         **dict.fromkeys(REFUSED, "refused"),
         **dict.fromkeys(("nx", "ny", "nz", "alpha", "intensity", "confidence", "id"), "harmless"),
         **dict.fromkeys(("semantic_*", "feature_*", "language_feature_*", "ins_feat_*", "obj_dc_*"), "harmless"),
+        "fea_*": "harmless",
         **dict.fromkeys(("object_id", "label", "segment_id", "Original_cloud_index"), "harmless"),
         **dict.fromkeys(("face", "edge", "extrinsic", "intrinsic", "image_size", "frame"), "harmless"),
         **dict.fromkeys(("disparity", "color_space", "version"), "harmless"),

@@ -49,6 +49,7 @@ def in_millions(count: float) -> float:
         ("msdgs-plane", 10 * 131_083),
         ("deformgs", 522_280),
         ("4dgs", 3_365_770),
+        ("sc-gs", 522_280 + 1_028),
         ("static", 0),
     ],
 )

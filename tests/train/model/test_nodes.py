@@ -178,7 +178,7 @@ def test_a_body_that_moves_as_one_is_rigid() -> None:
         expected = torch.where(touched, 0.5 / (distances.gather(1, near) + 0.01), 0.0).mean()
         motions = support.motions(chain, means, time(0.4))
         assert float(support.local_rigidity(motions)) == pytest.approx(float(expected))
-        gaussians = CanonicalPoints(means, torch.zeros(6, 4), {})
+        gaussians = CanonicalPoints(means, torch.zeros(6, 4), {}, torch.zeros(6, 4))
         weighted = support.regularizers(motions, gaussians, time(0.4), torch.Generator())
         assert {name: float(term) for name, term in weighted.items()} == {"arap": pytest.approx(0.1 * float(expected))}
 

@@ -1,0 +1,43 @@
+"""Nearest and farthest points."""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from msdgs_serve.threads import run_parallel, split_evenly
+from msdgs_train.layers.arrays import to_array
+from msdgs_train.supports.nearest_kernels import nearest_rows
+
+PARTS = 8
+CHUNK = 1 << 14
+"""Points whose distances to all centers are in memory at once."""
+
+
+def nearest(points: Tensor, centers: Tensor, count: int) -> Tensor:
+    """[N, F] int64 ids of the nearest of M centers, [M, D], to each of N points, [N, D], from the nearest to the
+    farthest; F is `count`, at most M."""
+    if points.is_cuda:
+        return nearest_by_sorting(points, centers, count)
+    columns = to_array(centers.detach().T)
+    rows, ids = to_array(points), np.zeros((len(points), min(count, len(centers))), np.int64)
+    run_parallel(nearest_rows, [(rows, columns, *part, ids) for part in split_evenly(len(rows), PARTS)])
+    return torch.from_numpy(ids).to(points.device)
+
+
+def nearest_by_sorting(points: Tensor, centers: Tensor, count: int) -> Tensor:
+    """As `nearest`, by torch's operations."""
+    most = min(count, len(centers))
+    parts = [torch.cdist(chunk, centers).topk(most, largest=False).indices for chunk in points.detach().split(CHUNK)]
+    return torch.cat(parts) if parts else points.new_zeros(0, most, dtype=torch.int64)
+
+
+def farthest_points(points: Tensor, count: int, first: int) -> tuple[Tensor, Tensor]:
+    """Farthest-point sampling: [count] ids of N points, [N, D], each the farthest from those before it, and the
+    distance of every point, [N], to the nearest of them."""
+    chosen, ids = first, []
+    distances = points.new_full((len(points),), torch.inf)
+    for _ in range(count):
+        ids.append(chosen)
+        distances = torch.minimum(distances, (points - points[chosen]).norm(dim=1))
+        chosen = int(distances.argmax())
+    return torch.tensor(ids, device=points.device), distances
