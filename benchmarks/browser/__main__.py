@@ -78,7 +78,8 @@ def scenes_of(options: Compare, folder: Path) -> list[Scene]:
 
 def quality(browser: Browser, address: str, scenes: list[Scene], options: Compare) -> bool:
     """Print the PSNR between our page's frames and the service's. Return whether all are near enough."""
-    report = table(f"PSNR to the service, {options.views} views", "scene", "Gaussians", "worst, dB", "median, dB")
+    columns = "scene", "Gaussians", "worst, dB", "median, dB", "memory, MB"
+    report = table(f"PSNR to the service, {options.views} views", *columns)
     rng, renderer, worst = np.random.default_rng(options.seed), Renderer(), np.inf
     for scene in scenes:
         first, last = scene.session.scene.metadata.time_range
@@ -89,9 +90,10 @@ def quality(browser: Browser, address: str, scenes: list[Scene], options: Compar
                 camera, t = around(scene.session, options.size, *angles), rng.uniform(first, last)
                 frame = renderer.render(scene.session, camera, t).display_pixels() / 255
                 found.append(psnr(page.image(camera, t), frame))
+            megabytes = page.megabytes()
         worst = min(worst, *found)
         count = f"{len(scene.session.scene):,}"
-        report.add_row(scene.file.stem, count, f"{min(found):.1f}", f"{np.median(found):.1f}")
+        report.add_row(scene.file.stem, count, f"{min(found):.1f}", f"{np.median(found):.1f}", f"{megabytes:.0f}")
     report_console().print(report)
     return worst >= MIN_PSNR
 
