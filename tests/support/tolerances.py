@@ -129,6 +129,12 @@ TABLE = (
     Row("damaged_file.seconds", 20.0, "of the processor; small files take milliseconds; some code is compiled, too"),
     Row("damaged_file.megabytes", 8.0, "beside twice the sound file's: what the allocator keeps from call to call"),
     Row("import.network", 1e-5, "a network of 8 layers in float32, its sums in another order"),
+    Row("agreement.forward", 1e-4, "another program's network in float32; numbers of size 1"),
+    Row(
+        "agreement.training",
+        1e-3,
+        "as forward after five steps of Adam, which divides by small gradients; relative too",
+    ),
     Row("visionary.relative", 2e-5, "products of float32 rotations and scales, relative to the largest covariance"),
     Row("visionary.sh", 2e-3, "float16 of coefficients up to 3"),
     # datasets
