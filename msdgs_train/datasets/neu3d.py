@@ -6,7 +6,9 @@ right, back), its position, and height, width and focal length in pixels; the pr
 World axes are those of the file. Images may be downscaled copies of the size in the matrix.
 
 A camera is `cam07.mp4`, or a folder `cam07/` or `cam07/images/`, which is preferred as it needs no decoding. Cameras
-are synchronized: all have F frames, and frame i is at t = i / (F - 1). The first camera, cam00, is the test view.
+are synchronized: all have F frames, and frame i is at t = i / (F - 1). The first camera, cam00, is the test view and
+not trained on. Rows without a camera are left out if rows are numbered as cameras are. In coffee_martini, whose cam13
+isn't synchronized, that one is left out, whether it is there or not.
 """
 
 import re
@@ -40,6 +42,9 @@ NEU3D_FIELDS = FieldTable(
 )
 """Columns of `poses_bounds.npy`, and what the videos' headers say of their frames."""
 
+UNSYNCHRONIZED = ("coffee_martini", "cam13")
+"""A scene, and its camera that publications leave out."""
+
 VIDEO = ".mp4"
 CAMERA_NAME = re.compile(r"cam\d+")
 
@@ -48,10 +53,8 @@ def load_neu3d(folder: Path, size: int | None = None) -> SceneData:
     """Read the cameras and, if there is a `.ply` file, the sparse points of a Neu3D scene, as `load_scene` does."""
     cameras, file = _find_cameras(folder), folder / POSES_FILE
     poses = read_table(file, 17)
-    if len(poses) != len(cameras):
-        problem = f"are {len(poses)}, but there are {len(cameras)} cameras: {' '.join(cameras)}. There must be one row "
-        raise DatasetInvalid(file, "rows", problem + "per camera, in the order of their names")
-    views = [_view(file, row, name, cameras[name], poses[row], size) for row, name in enumerate(cameras)]
+    rows = _rows(folder, file, list(cameras), len(poses))
+    views = [_view(file, row, name, cameras[name], poses[row], size) for name, row in rows.items()]
     first = views[0]
     for view in views:
         if len(view) != len(first):
@@ -60,6 +63,21 @@ def load_neu3d(folder: Path, size: int | None = None) -> SceneData:
     points, colors = _read_points(folder)
     splits = {"train": [frame for view in views[1:] for frame in view], "val": [], "test": first}
     return SceneData(splits, scene_half_size(points, [view[0].camera for view in views]), points, colors)
+
+
+def _rows(folder: Path, file: Path, names: list[str], count: int) -> dict[str, int]:
+    """The row of each camera that is used, given the cameras' names in order and the number of rows."""
+    left_out = {UNSYNCHRONIZED[1]} if UNSYNCHRONIZED[0] in folder.resolve().name else set()
+    in_order = sorted({*names, *left_out}, key=natural_order)
+    numbers = [int(name.removeprefix("cam")) for name in names]
+    if count in (len(in_order), len(names)):
+        found = {name: row for row, name in enumerate(in_order if count == len(in_order) else names)}
+    elif len(names) < count and max(numbers) < count:
+        found = dict(zip(names, numbers, strict=True))
+    else:
+        problem = f"are {count}, but there are {len(names)} cameras: {' '.join(names)}. There must be one row "
+        raise DatasetInvalid(file, "rows", problem + "per camera, in the order of their names")
+    return {name: found[name] for name in names if name not in left_out}
 
 
 def _find_cameras(folder: Path) -> dict[str, list[Path]]:

@@ -75,6 +75,30 @@ def test_a_camera_may_be_left_out_and_numbers_need_no_zeros(tmp_path: Path):
         assert (frame.camera.position == row[[3, 8, 13]]).all()
 
 
+@pytest.mark.parametrize(
+    ("folder", "names", "rows", "used"),
+    [
+        ("scene", ("cam00", "cam01", "cam03"), 4, {"cam01": 1, "cam03": 3}),
+        ("coffee_martini", ("cam00", "cam12", "cam13", "cam14"), 4, {"cam12": 1, "cam14": 3}),
+        ("coffee_martini", ("cam00", "cam12", "cam14"), 4, {"cam12": 1, "cam14": 3}),
+        ("coffee_martini", ("cam00", "cam12", "cam14"), 3, {"cam12": 1, "cam14": 2}),
+    ],
+    ids=["missing", "not synchronized", "its video removed", "its row removed too"],
+)
+def test_cameras_that_are_missing_or_left_out(
+    tmp_path: Path, folder: str, names: tuple[str, ...], rows: int, used: dict[str, int]
+) -> None:
+    """The test view isn't trained on."""
+    (tmp_path / folder).mkdir()
+    write_neu3d(tmp_path / folder, SMALL, names=names, count=1)
+    poses = poses_bounds(rows, SMALL)
+    poses[:, 3] = np.arange(rows)  # the first coordinate of the position
+    np.save(tmp_path / folder / "poses_bounds.npy", poses)
+    scene = load_scene(tmp_path / folder)
+    assert {f.name.split("_")[0]: f.camera.position[0] for f in scene.splits["train"]} == used
+    assert [f.name.split("_")[0] for f in scene.splits["test"]] == ["cam00"]
+
+
 def waves(width: int, height: int) -> np.ndarray:
     """Color changes vertically only, since H.264 and FFmpeg's encoder differ in the horizontal position of chroma."""
     y, x = np.mgrid[0:height, 0:width]
