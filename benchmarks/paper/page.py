@@ -51,11 +51,17 @@ class Results:
             length = f"{b.minutes:g} {'CPU minutes' if b.time == 'cpu' else 'minutes'} a run"
         elif b.steps is not None:
             length = f"{b.steps:,} steps a run"
-        widths = {run.config.data.size for run in self.runs}
-        size = (
-            "" if widths == {None} else f", images {' or '.join(str(width or 'whole') for width in widths)} pixels wide"
-        )
-        return f"{self.table.title}, {length}{size}{', small systems' if self.small else ''}"
+        shown = {row["scene"] for row in self.rows}
+        widths = {width for run in self.runs if run.scene in shown and (width := run.config.data.size)}
+        size = f", images {' or '.join(map(str, sorted(widths)))} pixels wide" if widths else ""
+        notes = (", small systems" if self.small else "") + (", not the paper's setting" if self.is_short else "")
+        return f"{self.table.title}, {length}{size}{notes}"
+
+    @property
+    def is_short(self) -> bool:
+        """Whether less is trained than published."""
+        b = self.budget
+        return self.small or any(limit is not None for limit in (b.minutes, b.steps, b.size))
 
     def columns(self) -> Iterator[tuple[str, str]]:
         """Scene and split: the paper's scenes, and others that have runs."""
@@ -77,7 +83,9 @@ def sections(results: Results) -> Iterator[Section]:
     for metric in results.table.metrics:
         for place, (heading, column, digits) in enumerate(VARIANTS[metric]):
             published = results.table.metrics.index(metric) if place == 0 else None
-            yield _numbers(results, heading, column, digits, published)
+            section = _numbers(results, heading, column, digits, published)
+            if published is not None or any(set(line[1:]) != {NONE} for line in section.lines):
+                yield section
     yield _gains(results)
     yield _gaps(results)
     yield _parameters(results)
@@ -86,9 +94,9 @@ def sections(results: Results) -> Iterator[Section]:
 
 
 def _conditions(results: Results) -> Iterator[str]:
-    rows, budget = results.rows, results.budget
+    rows = results.rows
     cells = f"Each cell has ours / the paper's; {NONE}: not measured, or not in the paper."
-    if results.small or budget.minutes or budget.steps or budget.size:
+    if results.is_short:
         cells += (
             " The paper trains whole schedules at full size on an RTX 3090. Ours, made as the title says, show the "
             "order of the systems under one budget, not whether its numbers can be reached."
@@ -98,8 +106,8 @@ def _conditions(results: Results) -> Iterator[str]:
         days = sorted({row["date"] for row in rows})
         seeds = ", ".join(sorted({row["seed"] for row in rows}, key=int))
         yield (
-            f"{len(rows)} runs, of the last model, mean ± standard deviation over seeds; seeds {seeds}; "
-            f"{budget.threads} thread(s) of {machines_of(rows)}; {days[0]} to {days[-1]}."
+            f"{len(rows)} finished run(s): of the last model, mean ± standard deviation over seeds; seeds {seeds}; "
+            f"{results.budget.threads} thread(s) of {machines_of(rows)}; {days[0]} to {days[-1]}."
         )
     else:
         yield "No run is finished."
@@ -135,7 +143,7 @@ def _numbers(results: Results, heading: str, column: str, digits: int, published
 
 
 def _cell(ours: str, method: Method, scene: str, digits: int, published: int | None) -> str:
-    if published is None:
+    if published is None or not method.numbers:
         return ours
     numbers = method.numbers.get(scene)
     return f"{ours} / {f'{numbers[published]:.{digits}f}' if numbers else NONE}"
