@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers import arrays
 from msdgs_train.layers.base import (
     PAPER_HEADS,
     DeformationLayer,
@@ -18,6 +19,7 @@ from msdgs_train.layers.base import (
     check_size,
 )
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
+from msdgs_train.layers.precision import chosen_precision, matrix_products
 
 HIDDEN_BIAS, XYZ_GAIN, TIME_GAIN = -1.0, 2.0, 3.0
 """Initialization: bias of the hidden units, and factors of the first Linear's columns."""
@@ -33,7 +35,10 @@ def frequency_matrix(dimensions: int, frequencies: int) -> Tensor:
 
 def positional_encoding(x: Tensor, frequencies: Tensor) -> Tensor:
     """γ(x): [N, D] → [N, D + 2·F·D], ordered x, sin 1x, sin 2x, sin 4x …, cos 1x, cos 2x, cos 4x … (no π)."""
-    phases = x @ frequencies  # 12x faster than a broadcast product of shape [N, F, 3] on a CPU
+    if arrays.has_kernels(x):
+        phases = x @ frequencies  # 12x faster than a broadcast product of shape [N, F, 3] on a CPU
+    else:  # a product of matrices isn't exact in TF32
+        phases = x.repeat(1, frequencies.shape[1] // frequencies.shape[0]) * frequencies.sum(dim=0)
     return torch.cat([x, phases.sin(), phases.cos()], dim=-1)
 
 
@@ -148,12 +153,24 @@ def _encode_backward(grad: Tensor, encoded: Tensor, frequencies: Tensor) -> Tens
     d, n = frequencies.shape
     sines, cosines = encoded[..., d : d + n], encoded[..., d + n :]
     grad_phases = (grad[..., d : d + n] * cosines).addcmul_(grad[..., d + n :], sines, value=-1)
-    return torch.addmm(grad[..., :d], grad_phases, frequencies.t())
+    if arrays.has_kernels(grad):
+        return torch.addmm(grad[..., :d], grad_phases, frequencies.t())
+    return grad[..., :d] + (grad_phases * frequencies.sum(dim=0)).unflatten(-1, (-1, d)).sum(dim=-2)
+
+
+def _add_product(total: Tensor, a: Tensor, b: Tensor) -> None:
+    if a.dtype == total.dtype:
+        total.addmm_(a, b)
+    else:
+        total.add_(a @ b)
 
 
 class _Network(torch.autograd.Function):
     """All outputs of an `MLPLayer`, [N, sum of `heads.sizes`], with a backward of its own: for the 512 rows of control
-    nodes, matrix products take less time than the operations that torch records between them."""
+    nodes, matrix products take less time than the operations that torch records between them.
+
+    The large products of the trunk, and those of their gradients, are in `chosen_precision()`.
+    """
 
     @staticmethod
     def forward(
@@ -166,25 +183,29 @@ class _Network(torch.autograd.Function):
         *params: Tensor,
     ) -> Tensor:
         time_weight, time_bias, code_weight, code_bias, *trunk, heads_weight, heads_bias = params
+        ctx.precision = precision = chosen_precision()
         encoded = positional_encoding(means, xyz_frequencies)
+        narrow = torch.bfloat16 if precision == "bf16" else encoded.dtype
         encoded_time = positional_encoding(t.reshape(1, 1), time_frequencies)[0]
         time_hidden = torch.addmv(time_bias, time_weight, encoded_time).relu_()
         code = torch.addmv(code_bias, code_weight, time_hidden)
         split = encoded.shape[1], encoded.shape[1] + len(code)
-        hidden = []
-        for index, (weight, bias) in enumerate(zip(trunk[::2], trunk[1::2], strict=True)):
-            if index in (0, skip):
-                bias = torch.addmv(bias, weight[:, split[0] : split[1]], code)
-                read = torch.addmm(bias, encoded, weight[:, : split[0]].t())
-                read = torch.addmm(read, hidden[-1], weight[:, split[1] :].t()) if index else read
-            else:
-                read = torch.addmm(bias, hidden[-1], weight.t())
-            hidden.append(read.relu_())
+        hidden, read_by_trunk = [], encoded.to(narrow)
+        with matrix_products(precision):
+            for index, (weight, bias) in enumerate(zip(trunk[::2], trunk[1::2], strict=True)):
+                if index in (0, skip):
+                    bias = torch.addmv(bias, weight[:, split[0] : split[1]], code)
+                    weight, bias = weight.to(narrow), bias.to(narrow)
+                    read = torch.addmm(bias, read_by_trunk, weight[:, : split[0]].t())
+                    read = torch.addmm(read, hidden[-1], weight[:, split[1] :].t()) if index else read
+                else:
+                    read = torch.addmm(bias.to(narrow), hidden[-1], weight.to(narrow).t())
+                hidden.append(read.relu_())
         ctx.skip, ctx.split, ctx.time_shape = skip, split, t.shape
         saved = (xyz_frequencies, time_frequencies, encoded, encoded_time, time_hidden, code)
         ctx.save_for_backward(*saved, *params, *hidden)
         ctx.num_params = len(params)
-        return torch.addmm(heads_bias, hidden[-1], heads_weight.t())
+        return torch.addmm(heads_bias, hidden[-1].to(encoded.dtype), heads_weight.t())
 
     @staticmethod
     @once_differentiable
@@ -193,25 +214,27 @@ class _Network(torch.autograd.Function):
         params, hidden = rest[: ctx.num_params], rest[ctx.num_params :]
         (time_weight, _, code_weight, _), trunk, heads_weight = params[:4], params[4:-2], params[-2]
         begin, end = ctx.split
-        grads: list[Tensor] = [grad.t() @ hidden[-1], grad.sum(dim=0)]
-        grad_hidden = grad @ heads_weight
+        wide, narrow = encoded.dtype, hidden[-1].dtype
+        grads: list[Tensor] = [grad.t() @ hidden[-1].to(wide), grad.sum(dim=0)]
+        grad_hidden = (grad @ heads_weight).to(narrow)
         wants_means, wants_t = ctx.needs_input_grad[:2]
-        grad_encoded, grad_code = torch.zeros_like(encoded), torch.zeros_like(code)
-        for index in reversed(range(len(hidden))):
-            weight, below = trunk[2 * index], hidden[index - 1] if index else None
-            grad_read = torch.ops.aten.threshold_backward(grad_hidden, hidden[index], 0)
-            grad_bias = grad_read.sum(dim=0)
-            if index in (0, ctx.skip):
-                if wants_means:
-                    grad_encoded.addmm_(grad_read, weight[:, :begin])
-                grad_code.addmv_(weight[:, begin:end].t(), grad_bias)
-                parts = [grad_read.t() @ encoded, torch.outer(grad_bias, code)]
-                parts += [] if below is None else [grad_read.t() @ below]
-                grad_weight, weight = torch.cat(parts, dim=1), weight[:, end:]
-            else:
-                grad_weight = grad_read.t() @ hidden[index - 1]
-            grads = [grad_weight, grad_bias, *grads]
-            grad_hidden = grad_read @ weight if index else grad_read
+        grad_encoded, grad_code, read_by_trunk = torch.zeros_like(encoded), torch.zeros_like(code), encoded.to(narrow)
+        with matrix_products(ctx.precision):
+            for index in reversed(range(len(hidden))):
+                weight, below = trunk[2 * index], hidden[index - 1] if index else None
+                grad_read = torch.ops.aten.threshold_backward(grad_hidden, hidden[index], 0)
+                grad_bias = grad_read.sum(dim=0, dtype=wide)
+                if index in (0, ctx.skip):
+                    if wants_means:
+                        _add_product(grad_encoded, grad_read, weight[:, :begin].to(narrow))
+                    grad_code.addmv_(weight[:, begin:end].t(), grad_bias)
+                    parts = [(grad_read.t() @ read_by_trunk).to(wide), torch.outer(grad_bias, code)]
+                    parts += [] if below is None else [(grad_read.t() @ below).to(wide)]
+                    grad_weight, weight = torch.cat(parts, dim=1), weight[:, end:]
+                else:
+                    grad_weight = (grad_read.t() @ hidden[index - 1]).to(wide)
+                grads = [grad_weight, grad_bias, *grads]
+                grad_hidden = grad_read @ weight.to(narrow) if index else grad_read
         grad_time_hidden = torch.ops.aten.threshold_backward(code_weight.t() @ grad_code, time_hidden, 0)
         grads = [torch.outer(grad_time_hidden, encoded_time), grad_time_hidden,
                  torch.outer(grad_code, time_hidden), grad_code, *grads]  # fmt: skip

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.threads import run_parallel, split_evenly
+from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import (
     PAPER_HEADS,
@@ -24,6 +25,7 @@ from msdgs_train.layers.base import (
 )
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.plane_kernels import plane_features, plane_gradients
+from msdgs_train.layers.plane_sampling import sampled_features
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
 SPACE_INIT = (0.1, 0.5)
@@ -114,15 +116,20 @@ class PlaneGrid(nn.Module):
     def forward(self, means: Tensor, t: Tensor) -> Tensor:
         """Features [N, C] of means, [N, 3], at time `t`, a scalar tensor."""
         positions = means * self.cells + self.origin
-        return _PlaneFeatures.apply(self.space, self.lines(t), positions)
+        read = _PlaneFeatures.apply if arrays.has_kernels(positions) else sampled_features
+        return read(self.space, self.lines(t), positions)
 
     def lines(self, t: Tensor) -> Tensor:
         """[3, S, C] the planes over time at time `t`, which is clamped to the time range."""
         nodes = self.time.shape[1]
         place = ((t - self.first_time) * self.time_cells).clamp(0, nodes - 1)
         below = place.floor().clamp(max=nodes - 2)
-        index = int(below)
-        return torch.lerp(self.time[:, index], self.time[:, index + 1], place - below)
+        if arrays.has_kernels(below):
+            index = int(below)
+            return torch.lerp(self.time[:, index], self.time[:, index + 1], place - below)
+        first = below.long()  # stays on the device, which the CPU doesn't wait for
+        before, after = self.time.index_select(1, torch.stack((first, first + 1))).unbind(dim=1)
+        return torch.lerp(before, after, place - below)
 
     @torch.no_grad()
     def on_window(self, before: float, after: float) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.quaternion_kernels import unit_backward, unit_forward
 
@@ -19,7 +20,18 @@ def unit(quats: Tensor) -> Tensor:
 
 def unit_or_identity(raw_quats: Tensor) -> Tensor:
     """Scaled to unit length; those of norm under 1e-8 have no direction and become the identity."""
-    return _Unit.apply(raw_quats)
+    return _Unit.apply(raw_quats) if arrays.has_kernels(raw_quats) else _unit_or_identity(raw_quats)
+
+
+def identity_like(quats: Tensor) -> Tensor:
+    """[1, 4] the identity, made on the device: a copy from the CPU would wait for it."""
+    return torch.eye(1, 4, dtype=quats.dtype, device=quats.device)
+
+
+def _unit_or_identity(raw: Tensor) -> Tensor:
+    norms = torch.linalg.vector_norm(raw, dim=1, keepdim=True)
+    directed = norms >= MIN_NORM
+    return torch.where(directed, raw / torch.where(directed, norms, 1.0), identity_like(raw))
 
 
 class _Unit(torch.autograd.Function):

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers import arrays
 from msdgs_train.layers.base import DeformationLayer, Heads, LayerConfig, LayerStep, SceneBounds, check_size
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
-from msdgs_train.layers.quaternions import multiply, unit
+from msdgs_train.layers.quaternions import identity_like, multiply, unit
 
 NUM_KNOTS, MAX_KNOTS = 36, 120
 """Limits of the intervals that follow the captured times."""
@@ -82,18 +83,22 @@ class SplineLayer(DeformationLayer):
         read, part = self.knots_at(t)
         weights = cubic_weights(part)
         transls, rots, stretches = (torch.einsum("k,kbc->bc", weights, curve[read]) for curve in self._curves)
-        return LayerStep(transls, stretches, rots - rots.new_tensor([1.0, 0, 0, 0]), transls.new_ones(len(transls), 1))
+        return LayerStep(transls, stretches, rots - identity_like(rots), transls.new_ones(len(transls), 1))
 
     @property
     def _curves(self) -> tuple[Tensor, Tensor, Tensor]:
         return self.transls, self.rots, self.stretches
 
-    def knots_at(self, t: Tensor) -> tuple[slice, Tensor]:
-        """The four knots around a time, and its position, in [0, 1], between the second and the third of them."""
+    def knots_at(self, t: Tensor) -> tuple[slice | Tensor, Tensor]:
+        """The four knots around a time, as an index, and its position, in [0, 1], between the second and the third of
+        them."""
         knots = self.config.num_knots
         position = ((t - self.first_time) * self.knots_per_time).clamp(0, knots)
-        first = min(int(position), knots - 1)
-        return slice(first, first + 4), position - first
+        if arrays.has_kernels(position):
+            first = min(int(position), knots - 1)
+            return slice(first, first + 4), position - first
+        below = position.floor().clamp(max=knots - 1)  # stays on the device, which the CPU doesn't wait for
+        return below.long() + torch.arange(4, device=position.device), position - below
 
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)

@@ -9,8 +9,10 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.losses.kernels import TAPS, error_sums, loss_gradient, ssim_sum_and_derivatives
+from msdgs_train.losses.torch_photometric import TorchPhotometric
 
 MSE_SCALE = 4.0
 """Factor of MSE, at which it equals L1 for an error of 0.25."""
@@ -32,9 +34,10 @@ def photometric_loss(
     check_pair(rgb, target)
     rest = 1 - mse_fraction
     weights = rest * l1_weight, mse_fraction * MSE_SCALE, rest * (1 - l1_weight)
+    apply = _Photometric.apply if arrays.has_kernels(rgb) else TorchPhotometric.apply
     if mask is None:
-        return _Photometric.apply(rgb, target, *weights)
-    return _Photometric.apply(filled(rgb, target, mask), target, *weights) * share_factor(mask)
+        return apply(rgb, target, *weights)
+    return apply(filled(rgb, target, mask), target, *weights) * share_factor(mask, rgb.dtype)
 
 
 def ssim(rgb: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
@@ -51,9 +54,10 @@ def filled(rgb: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     return torch.where(mask[..., None], rgb, target)
 
 
-def share_factor(mask: Tensor) -> float:
-    """What turns a mean over all pixels, with no error outside of `mask`, into the mean over the pixels of the mask."""
-    return mask.numel() / max(int(mask.sum()), 1)
+def share_factor(mask: Tensor, dtype: torch.dtype) -> Tensor:
+    """What turns a mean over all pixels, with no error outside of `mask`, into the mean over the pixels of the mask; a
+    scalar."""
+    return mask.numel() / mask.sum().to(dtype).clamp(min=1)
 
 
 def check_pair(rgb: Tensor, target: Tensor) -> None:

@@ -21,7 +21,7 @@ from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import check_size
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.parameters import LearningRate
-from msdgs_train.layers.quaternions import rotation_matrices, stretch_matrices, unit
+from msdgs_train.layers.quaternions import identity_like, rotation_matrices, stretch_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
 from msdgs_train.supports.nearest import farthest_points
 from msdgs_train.supports.skinning import skin
@@ -194,7 +194,7 @@ def _first_nodes(n: int, columns: int, _: torch.Generator) -> Tensor:
 
 def _quaternions(deltas: Deltas) -> Tensor:
     """[M, 4] rotations of the nodes, not normalized."""
-    return deltas.quats + deltas.quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return deltas.quats + identity_like(deltas.quats)
 
 
 def skinning_weights(logits: Tensor) -> Tensor:

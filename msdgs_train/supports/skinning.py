@@ -9,7 +9,9 @@ from torch.autograd.function import once_differentiable
 
 from msdgs_serve.rasterizer.projection import part_range
 from msdgs_serve.threads import run_parallel
+from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
+from msdgs_train.supports import torch_skinning
 from msdgs_train.supports.skinning_kernels import DELTAS, skin_backward, skin_forward
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
@@ -25,7 +27,8 @@ def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Te
         ids: [N, F] int64, of the nodes that each Gaussian follows.
         motions: [M, 16] of the nodes: matrix by rows, offset, unit quaternion.
     """
-    return _Skin.apply(means, quats, weights, ids, motions)
+    apply = _Skin.apply if arrays.has_kernels(means) else torch_skinning.skin
+    return apply(means, quats, weights, ids, motions)
 
 
 class _Skin(torch.autograd.Function):

@@ -74,6 +74,15 @@ TABLE = (
     Row("kernel_coverage", 95.0, "per cent of the kernels' lines; what is left needs the compiler"),
     Row("cuda.pixel", 1e-3, "7e-4 where a splat's alpha is at the threshold in one of them; 3e-7 in the mean"),
     Row("cuda.psnr", 3.0, "dB; the same images in the same order, but no two runs of a few steps are alike"),
+    Row(
+        "torch_operations.float64",
+        1e-11,
+        "as the kernels in another order, relative to the largest; SSIM loses 3 digits",
+    ),
+    Row("torch_operations.float32", 2e-5, "as in float64; a position in cells is rounded at 1e-5 of a cell"),
+    Row(
+        "bf16.trunk", 0.2, "of the norm; roundings of 4e-3 flip units, and an octave of 512 amplifies them in positions"
+    ),
     Row("cuda.gradient", 1e-3, "of the largest of its kind; 4e-4 for the same reason"),
     # losses
     Row("ssim.float32", 1e-5, "variances are differences of blurred squares; torch blurs in another order"),
