@@ -66,12 +66,14 @@ class GradientStrategy(DensityStrategy):
         if self.patience:
             self.unseen = torch.where((norms > 0) & self.unseen.isfinite(), 0.0, self.unseen + 1)
             if shows_all:
-                self.unseen[~drawn] = torch.inf
+                self.unseen.masked_fill_(~drawn, torch.inf)
 
     def after_step(self, surgery: RowSurgery, steps: range) -> None:
         """`densify` and `reset_opacities` when they are due."""
         if self.patience and not self.is_rig and self.schedule.is_windowed(steps.stop - 1):
-            self.unseen[self.unseen.isfinite()] = 0  # images outside the window may show what those inside don't
+            self.unseen.masked_fill_(
+                self.unseen.isfinite(), 0.0
+            )  # images outside the window may show what those inside don't
         if any(map(self.schedule.refines_at, steps)):
             self.densify(surgery, steps[-1])
         if any(map(self.schedule.resets_at, steps)):

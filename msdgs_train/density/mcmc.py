@@ -16,7 +16,8 @@ from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
-from msdgs_train.layers.quaternions import rotate
+from msdgs_train.layers.arrays import to_device
+from msdgs_train.layers.quaternions import identity_like, rotate
 
 GROWTH = 1.05
 """Factor by which the number of Gaussians grows per round, up to the budget."""
@@ -76,9 +77,9 @@ class MCMCStrategy(DensityStrategy):
     def inject_noise(self, gaussians: CanonicalGaussians, rate: float) -> None:
         """Add noise with the covariance of each Gaussian to its mean, more at lower opacity (equation 9 there)."""
         gate = torch.sigmoid(-NOISE_SLOPE * (gaussians.raw_opacities.sigmoid() - self.config.prune_opa))
-        noise = torch.randn(len(gaussians), 3, generator=self.generator).to(gate.device)
+        noise = to_device(torch.randn(len(gaussians), 3, generator=self.generator), gate.device)
         quats = functional.normalize(gaussians.raw_quats, dim=1)
-        inverse = quats * quats.new_tensor([1.0, -1.0, -1.0, -1.0])
+        inverse = 2 * quats * identity_like(quats) - quats
         shaped = rotate(quats, gaussians.log_scales.exp().square() * rotate(inverse, noise))  # Σ times the noise
         gaussians.means.add_((rate * self.config.noise_lr * gate)[:, None] * shaped)
 

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -14,6 +14,7 @@ from msdgs_train.engine.curriculum_config import CurriculumConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.plugins import load_plugins
+from msdgs_train.layers.precision import Precision
 from msdgs_train.losses.config import LossConfig
 from msdgs_train.poses.config import PoseConfig
 from msdgs_train.settings import OWN_SETTINGS, Checked, SystemConfig, optional
@@ -38,8 +39,11 @@ class RunConfig(Checked):
     """CPU threads of torch: the same seed and threads give the same bits. Kernels use all cores, or MSDGS_THREADS;
     their bits don't depend on it."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """cuda: the model is on the GPU and rendered by gsplat (msdgs[cuda]), while the loss and the kernels of nodes and
-    planes stay on the CPU; the bits differ from run to run."""
+    """cuda: all of a step is on the GPU, rendered by gsplat (msdgs[cuda]); the bits differ from run to run."""
+    gpu_precision: Precision = "float32"
+    """cuda: of the matrix products of MLP trunks in training; encodings, heads and evaluations are in float32."""
+    gpu_image_memory: float = 8.0
+    """cuda: GiB of training images that stay on the GPU, as 8-bit RGBA; others are copied whenever they are drawn."""
     minutes: Annotated[float | None, optional("MINUTES")] = None
     """Length of the run instead of --steps: schedules are laid out over it. Evaluation and saving count, compiling
     kernels doesn't. The same seed no longer gives the same bits."""
@@ -53,6 +57,8 @@ class RunConfig(Checked):
         self.require_positive_or_none("minutes")
         self.require(("time",), "wall or cpu", lambda v: v in ("wall", "cpu"))
         self.require(("device",), "cpu or cuda", lambda v: v in ("cpu", "cuda"))
+        self.require(("gpu_precision",), "float32, tf32 or bf16", lambda v: v in get_args(Precision))
+        self.require_weights("gpu_image_memory")
 
 
 @dataclass(frozen=True)
@@ -199,7 +205,10 @@ def _own_type(system: Any) -> type[SystemConfig]:
     return OWN_SETTINGS[system]
 
 
-RESUMABLE_CHANGES = frozenset({"steps", "threads", "device", "minutes", "log_every", "eval_every", "checkpoint_every"})
+RESUMABLE_CHANGES = frozenset({
+    "steps", "threads", "device", "gpu_precision", "gpu_image_memory", "minutes", "log_every", "eval_every",
+    "checkpoint_every",
+})  # fmt: skip
 """Settings that may change when a run is resumed. All others have affected the model already."""
 
 

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from msdgs_train.datasets import Frame
 from msdgs_train.layers.parameters import ParamGroup
-from msdgs_train.systems.base import Target, ViewLoss
+from msdgs_train.systems.base import ViewLoss
+from msdgs_train.systems.targets import Target
 
 
 class ViewGradients(NamedTuple):
@@ -16,8 +17,8 @@ class ViewGradients(NamedTuple):
 
     frame: Frame
     view: ViewLoss
-    loss: float
-    squared_error: float  # mean over channels and the pixels that count
+    loss: Tensor
+    squared_error: Tensor  # mean over channels and the pixels that count
     gradients: dict[int, Tensor]  # by id of the parameter; those that the loss depends on
 
 
@@ -26,7 +27,7 @@ def differentiate(groups: Sequence[ParamGroup], frame: Frame, view: ViewLoss, ta
     parameters = [p for group in groups for p in group.params]
     found = torch.autograd.grad(view.loss, parameters, allow_unused=True)
     gradients = {id(p): gradient for p, gradient in zip(parameters, found, strict=True) if gradient is not None}
-    return ViewGradients(frame, view, view.loss.item(), target.squared_error(view.rgb), gradients)
+    return ViewGradients(frame, view, view.loss.detach(), target.squared_error(view.rgb), gradients)
 
 
 def average_gradients(groups: Sequence[ParamGroup], views: Sequence[ViewGradients]) -> None:

@@ -15,6 +15,7 @@ from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.datasets.identity import identity
 from msdgs_train.engine.clock import Clock
 from msdgs_train.engine.config import TrainConfig, check_resumable
+from msdgs_train.engine.meters import TrainingDiverged
 from msdgs_train.engine.metrics_log import (
     MetricsLog,
     best_evaluations,
@@ -41,7 +42,7 @@ from msdgs_train.engine.run_record import (
 )
 from msdgs_train.engine.schedule import Schedule, require_same_phase
 from msdgs_train.engine.tensorboard_events import require_tensorboard
-from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
+from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.evaluation.metrics import ImageMetrics, mean_metrics
 from msdgs_train.rendering.rasterize import require_device
 

@@ -9,36 +9,35 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.utils import clip_grad_norm_, get_total_norm
+from torch.nn.utils import clip_grad_norm_
 
-from msdgs_serve.scene.errors import MsdgsError
 from msdgs_serve.threads import sharing_cores
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum import WindowCurriculum
 from msdgs_train.engine.gradients import ViewGradients, average_gradients, differentiate
+from msdgs_train.engine.meters import DeviceMeter, Observed, StepMeter
 from msdgs_train.engine.optimizer import make_optimizer, set_learning_rates
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.evaluation.metrics import ImageMetrics, image_metrics, psnr_from_mse
 from msdgs_train.gaussians import safe_load
+from msdgs_train.layers import arrays
+from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.parameters import ParamGroup
-from msdgs_train.systems.base import Moment, System, Target
+from msdgs_train.layers.precision import trunk_precision
+from msdgs_train.systems.base import Moment, System
 from msdgs_train.systems.registry import system_of
+from msdgs_train.systems.targets import Target, TrainingImages
 
 FORMAT = "msdgs-checkpoint/3"
-MAX_SKIPPED_IN_A_ROW = 20
+READ_EVERY = 20  # steps at most between looks at the results of steps on a GPU
 ROLLBACK_LR = 0.5  # factor of the learning rates, each time that training returns to a checkpoint
 ROLLBACK_SEED = 1_000_003  # added to the seed of the images' order
-SMOOTHING = 0.98  # of the reported loss and PSNR: a moving average over about 50 steps
-
-
-class TrainingDiverged(MsdgsError):
-    """The loss or its gradient has not been finite for many steps in a row."""
 
 
 class StepResult(NamedTuple):
-    """Metrics after one step."""
+    """Metrics after one step; on a GPU, loss to clamped scales are those of the last step that was read."""
 
     step: int  # of the schedule, counted from 1
     loss: float  # moving average
@@ -64,15 +63,18 @@ class Trainer:
         torch.set_num_threads(config.run.threads if config.run.batch_size == 1 else 1)
         self.config, self.scene = config, scene
         self.schedule = Schedule.from_config(config)
-        self.skipped = self.rollbacks = 0
-        self._images = ImageCache()
+        self.rollbacks = 0
+        self._images, run = ImageCache(), config.run
+        self._is_on_host = arrays.has_kernels(torch.empty(0, device=run.device))
+        resident = 0 if self._is_on_host else round(run.gpu_image_memory * 2**30)
+        self._training_images = TrainingImages(self._images, run.device, resident)
         self._reset()
 
     def _reset(self) -> None:
         """The state before the first step."""
-        self.step_count = self.optimizer_steps = self._skipped_in_a_row = 0
+        self.step_count = self.optimizer_steps = 0
         self.reached = range(1)  # steps of the schedule since the last optimizer step
-        self._averages: tuple[float, float] | None = None  # loss, squared error
+        self._meter = StepMeter() if self._is_on_host else DeviceMeter(self.config.run.device)
         self._generator = torch.Generator().manual_seed(self.config.run.seed)
         self._curriculum = WindowCurriculum(self.schedule, self.scene.splits["train"], self.scene.time_range)
         self.system: System = system_of(self.schedule, self.scene)
@@ -89,25 +91,34 @@ class Trainer:
         set_learning_rates(self.optimizer, groups, self.schedule, self.step_count, self.lr_factor)
         views = self._render_and_backward(groups)
         average_gradients(groups, views)
-        loss = sum(view.loss for view in views) / len(views)
         self.reached = range(self.step_count + 1, self.step_count + advance + 1)
         self.step_count += advance
         self.optimizer_steps += 1
-        is_finite = self._is_finite(loss, [p.grad for g in groups for p in g.params if p.grad is not None])
-        if is_finite:
+        observed = Observed(
+            [view.loss for view in views],
+            [view.squared_error for view in views],
+            [view.view.clamped_scales for view in views],
+        )
+        gradients = [p.grad for g in groups for p in g.params if p.grad is not None]
+        is_accepted = self._meter.accept(self.step_count, observed, gradients, self.optimizer)
+        if is_accepted:
             clip = self.config.optimizer.gradient_clip
             if clip is not None:
                 # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
                 clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], clip)
             self.optimizer.step()
-            self._average(views)
-        self.system.after_step(
-            self.optimizer, self.reached, [(view.frame, view.view) for view in views] if is_finite else []
-        )
-        average_loss, average_error = self._averages or (float("nan"), float("nan"))
-        clamped = max(view.view.clamped_scales for view in views)
+        seen = [(view.frame, view.view) for view in views] if is_accepted else []
+        self.system.after_step(self.optimizer, self.reached, seen)
+        return self._result()
+
+    def _result(self) -> StepResult:
+        meter, every, last = self._meter, self.config.logging.log_every, self.config.run.steps
+        if any(step % every == 0 or step == last for step in self.reached) or self.optimizer_steps % READ_EVERY == 0:
+            meter.read()
+            meter.check(self.step_count)
+        loss, error = meter.averages or (float("nan"), float("nan"))
         return StepResult(
-            self.step_count, average_loss, psnr_from_mse(average_error), self.system.size, self.skipped, clamped
+            self.step_count, loss, psnr_from_mse(error), self.system.size, meter.skipped, meter.clamped_scales
         )
 
     @torch.no_grad()
@@ -122,15 +133,16 @@ class Trainer:
 
     def save_checkpoint(self, path: Path, seconds: float) -> None:
         """Write the complete state, from which training continues bit by bit; `seconds` of training so far. Atomic."""
+        self._meter.read()
         state = {
             "format": FORMAT,
             "step_count": self.step_count,
             "optimizer_steps": self.optimizer_steps,
             "reached": (self.reached.start, self.reached.stop),
             "seconds": seconds,
-            "skipped": (self.skipped, self._skipped_in_a_row),
+            "skipped": (self._meter.skipped, self._meter.skipped_in_a_row),
             "rollbacks": self.rollbacks,
-            "averages": self._averages,
+            "averages": self._meter.averages,
             "generators": [generator.get_state() for generator in self._generators()],
             "curriculum": self._curriculum.order,
             "system": self.system.state(),
@@ -156,16 +168,17 @@ class Trainer:
     def roll_back(self, checkpoint: Path) -> None:
         """Return to a checkpoint, or to the start if there is no such file, after training has diverged: with half the
         learning rates and another order of the images."""
-        skipped, rollbacks = self.skipped, self.rollbacks + 1
+        skipped, rollbacks = self._meter.skipped, self.rollbacks + 1
         self._reset()
         if checkpoint.exists():
             self.load_checkpoint(checkpoint)
-        self.skipped, self.rollbacks, self._skipped_in_a_row = skipped, rollbacks, 0
+        self.rollbacks = rollbacks
+        self._meter.load(skipped, 0, self._meter.averages)
         self._generator.manual_seed(self.config.run.seed + ROLLBACK_SEED * rollbacks)
         self._curriculum.order = torch.empty(0, dtype=torch.int64)
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self.step_count, self._averages = state["step_count"], state["averages"]
+        self.step_count = state["step_count"]
         self.optimizer_steps, self.reached = state["optimizer_steps"], range(*state["reached"])
         self.system.load_state(state["system"], self.step_count)
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
@@ -173,15 +186,22 @@ class Trainer:
         self._curriculum.order = state["curriculum"]
         if any(index >= len(self.scene.splits["train"]) for index in self._curriculum.order):
             raise LookupError("an image that this dataset doesn't have")
-        self.skipped, self._skipped_in_a_row = state["skipped"]
+        skipped, in_a_row = state["skipped"]
+        self._meter.load(skipped, in_a_row, state["averages"])
         self.rollbacks = state["rollbacks"]
         for generator, stored in zip(self._generators(), state["generators"], strict=True):
             generator.set_state(stored)
 
     @property
+    def skipped(self) -> int:
+        """Steps of the whole run whose loss or gradient was not finite."""
+        return self._meter.skipped
+
+    @property
     def is_skipping(self) -> bool:
         """Whether the last step was skipped."""
-        return self._skipped_in_a_row > 0
+        self._meter.read()
+        return self._meter.skipped_in_a_row > 0
 
     @property
     def lr_factor(self) -> float:
@@ -192,15 +212,15 @@ class Trainer:
         return [self._generator, *self.system.generators()]
 
     def _render_and_backward(self, groups: Sequence[ParamGroup]) -> list[ViewGradients]:
-        """Render the next batch and differentiate the loss of each image, in parallel."""
+        """Render the next batch and differentiate the loss of each image, on a CPU in parallel."""
         size = self.config.run.batch_size
         first = self.optimizer_steps * size
         drawn = [
             (self._curriculum.next(number, self.step_count, self._generator), self._next_background(), number)
             for number in range(first, first + size)
         ]
-        if size == 1:
-            return [self._differentiate(groups, *drawn[0])]
+        if size == 1 or not self._is_on_host:
+            return [self._differentiate(groups, *view) for view in drawn]
         return list(self._workers.map(lambda view: self._differentiate(groups, *view), drawn))
 
     @functools.cached_property
@@ -213,12 +233,13 @@ class Trainer:
         self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor, number: int
     ) -> ViewGradients:
         """Of the image of this number since the start of the run."""
-        if self.schedule.halves(frame.camera.width, self.step_count):
-            rgba, mask, frame = self._images.half_rgba(frame), self._images.half_mask(frame), frame.halved()
-        else:
-            rgba, mask = self._images.rgba(frame), self._images.mask(frame)
-        target = Target.over(rgba, background, self.config.run.device, mask)
-        view = self.system.loss(frame, target, background.to(target.rgb.device), self._moment(number))
+        run, is_halved = self.config.run, self.schedule.halves(frame.camera.width, self.step_count)
+        image = self._training_images.image(frame, is_halved=is_halved)
+        frame = frame.halved() if is_halved else frame
+        background = to_device(background, run.device)
+        target = Target.over(image, background)
+        with trunk_precision("float32" if self._is_on_host else run.gpu_precision):
+            view = self.system.loss(frame, target, background, self._moment(number))
         return differentiate(groups, frame, view, target)
 
     def _moment(self, number: int) -> Moment:
@@ -229,21 +250,3 @@ class Trainer:
         if self.config.data.background == "random":
             return torch.rand(3, generator=self._generator)
         return torch.tensor(self.config.data.evaluation_background)
-
-    def _is_finite(self, loss: float, gradients: list[Tensor]) -> bool:
-        if bool(torch.isfinite(loss + get_total_norm(gradients, foreach=True))):
-            self._skipped_in_a_row = 0
-            return True
-        self.skipped += 1
-        self._skipped_in_a_row += 1
-        if self._skipped_in_a_row >= MAX_SKIPPED_IN_A_ROW:
-            raise TrainingDiverged(
-                f"the loss or its gradient was not finite for {MAX_SKIPPED_IN_A_ROW} steps in a row, up to step "
-                f"{self.step_count}"
-            )
-        return False
-
-    def _average(self, views: list[ViewGradients]) -> None:
-        loss, error = (sum(getattr(v, name) for v in views) / len(views) for name in ("loss", "squared_error"))
-        old = self._averages or (loss, error)
-        self._averages = (SMOOTHING * old[0] + (1 - SMOOTHING) * loss, SMOOTHING * old[1] + (1 - SMOOTHING) * error)

@@ -27,6 +27,6 @@ def add_to_scales(space: ScaleSpace, log_scales: Tensor, deltas: Tensor) -> Tens
     return (activated_scales(log_scales) + deltas).clamp_min(MIN_SCALE)
 
 
-def count_clamped(space: ScaleSpace, scales: Tensor) -> int:
-    """Number of Gaussians with a scale that was clamped because it was 0 or below."""
-    return 0 if space == "log" else int((scales <= MIN_SCALE).any(dim=1).sum())
+def count_clamped(space: ScaleSpace, scales: Tensor) -> Tensor | int:
+    """Number of Gaussians with a scale that was clamped because it was 0 or below; on the device of the scales."""
+    return 0 if space == "log" else (scales <= MIN_SCALE).any(dim=1).sum()

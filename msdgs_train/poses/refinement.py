@@ -13,6 +13,7 @@ from torch import nn
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame
 from msdgs_train.gaussians.model import PosedGaussians
+from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.quaternions import multiply, rotate, unit
 from msdgs_train.poses.config import PoseConfig
@@ -36,9 +37,9 @@ class PoseRefinement(nn.Module):
         """The Gaussians as the refined camera sees them, in the axes of the given one."""
         rotation, translation = self.twists[self._rows[_key(camera)]].split(3)
         back = unit(torch.cat([rotation.new_ones(1), -rotation / 2])[None])  # off by angle³ / 12
-        turned_axes = rotate(back, torch.eye(3).to(back))
-        turned_units = multiply(back.expand(4, 4), torch.eye(4).to(back))
-        center = posed.means.new_tensor(camera.position)
+        turned_axes = rotate(back, torch.eye(3, dtype=back.dtype, device=back.device))
+        turned_units = multiply(back.expand(4, 4), torch.eye(4, dtype=back.dtype, device=back.device))
+        center = to_device(torch.tensor(camera.position).to(posed.means.dtype), posed.means.device)
         means = torch.addmm(center, posed.means - (center + DISTANCE * translation), turned_axes)
         return posed._replace(means=means, quats=posed.quats @ turned_units)
 

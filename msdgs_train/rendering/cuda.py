@@ -6,6 +6,7 @@ from torch import Tensor
 
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, InvalidInput
+from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.quaternions import rotation_matrices
 from msdgs_train.rendering.info import RasterizationInfo
 
@@ -34,8 +35,8 @@ def rasterize_cuda(
         scales,
         opacities,
         sh,
-        torch.tensor(camera.world_to_camera, dtype=torch.float32, device=means.device)[None],
-        intrinsics.to(means.device)[None],
+        to_device(torch.tensor(camera.world_to_camera, dtype=torch.float32), means.device)[None],
+        to_device(intrinsics, means.device)[None],
         camera.width,
         camera.height,
         near_plane=options.near_plane,
@@ -51,7 +52,8 @@ def rasterize_cuda(
     if means2d.requires_grad:  # gsplat has set `absgrad` when the gradient arrives
 
         def keep(grad: Tensor) -> None:
-            info.means2d_grads = (means2d.absgrad if absolute_gradients else grad)[0]
+            kept = means2d.absgrad if absolute_gradients else grad
+            info.means2d_grads = kept[0].nan_to_num(0.0, 0.0, 0.0)  # of steps that the optimizer doesn't take
 
         means2d.register_hook(keep)
     return rgb[0], alpha[0, ..., 0]

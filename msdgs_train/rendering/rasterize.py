@@ -16,6 +16,7 @@ from msdgs_serve.rasterizer.tiles import bin_into_tiles
 from msdgs_serve.rasterizer.view import GSPLAT, RasterizerOptions
 from msdgs_serve.scene import Camera, Gaussians
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.rendering.info import RasterizationInfo
 
@@ -63,7 +64,7 @@ def rasterize(
     """
     info = RasterizationInfo()
     gaussians = (means, quats, scales, opacities, sh)
-    if means.is_cuda:
+    if not arrays.has_kernels(means):
         from msdgs_train.rendering.cuda import rasterize_cuda
 
         rgb, alpha = rasterize_cuda(gaussians, camera, background, options, info, absolute_gradients, raw_quats)

@@ -3,50 +3,13 @@
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene import Camera
-from msdgs_train.datasets import Frame, composite
+from msdgs_train.datasets import Frame
 from msdgs_train.layers.parameters import ParamGroup
-
-
-class Target(NamedTuple):
-    """A training image, on the run's device, as the background is."""
-
-    rgb: Tensor  # [H, W, 3] in [0, 1], over the background
-    alpha: Tensor  # [H, W] uint8
-    mask: Tensor | None = None  # [H, W] bool, true where pixels count; None: all do
-
-    @classmethod
-    def over(
-        cls, rgba: np.ndarray, background: Tensor, device: str = "cpu", mask: np.ndarray | None = None
-    ) -> "Target":
-        """An image, [H, W, 4] uint8 with straight alpha, over a background color, [3]."""
-        rgb, alpha = composite(rgba, background.numpy()), rgba[:, :, 3].copy()
-        counts = None if mask is None else torch.from_numpy(mask).to(device)
-        return cls(torch.from_numpy(rgb).to(device), torch.from_numpy(alpha).to(device), counts)
-
-    @property
-    def shows_all(self) -> bool:
-        """Whether the border is transparent around what the image shows, so that nothing of the scene is outside it; an
-        empty image may have all of it outside. Masked pixels may show anything."""
-        a = self.alpha if self.mask is None else self.alpha.masked_fill(~self.mask, 255)
-        return bool(a.any()) and not bool(a[0].any() or a[-1].any() or a[:, 0].any() or a[:, -1].any())
-
-    def alpha_error(self, alpha: Tensor) -> Tensor:
-        """Mean absolute difference of a rendering's alpha, [H, W] in [0, 1], over the pixels that count, or 0 if the
-        image is opaque."""
-        if bool((self.alpha == 255).all()):
-            return alpha.new_zeros(())
-        error = (alpha - self.alpha * (1 / 255)).abs()
-        return error.mean() if self.mask is None else (error * self.mask).sum() / self.mask.sum().clamp(min=1)
-
-    def squared_error(self, rgb: Tensor) -> float:
-        """Mean squared difference of a rendering, [H, W, 3], over channels and the pixels that count."""
-        error = (rgb.detach() - self.rgb).square()
-        return float(error.mean() if self.mask is None else error[self.mask].mean().nan_to_num())
+from msdgs_train.systems.targets import Target
 
 
 class Moment(NamedTuple):
@@ -61,7 +24,7 @@ class ViewLoss(NamedTuple):
 
     loss: Tensor  # scalar
     rgb: Tensor  # [H, W, 3]
-    clamped_scales: int = 0  # Gaussians a scale of which was clamped
+    clamped_scales: Tensor | int = 0  # Gaussians a scale of which was clamped
     screen: Any = None  # results of the backward pass for `after_step`
     shows_all: bool = False  # nothing of the scene is outside the image
 

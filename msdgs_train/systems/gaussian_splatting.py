@@ -30,7 +30,8 @@ from msdgs_train.losses.photometric import photometric_loss
 from msdgs_train.poses.refinement import PoseRefinement
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.supports.base import CanonicalPoints
-from msdgs_train.systems.base import Moment, Target, ViewLoss
+from msdgs_train.systems.base import Moment, ViewLoss
+from msdgs_train.systems.targets import Target
 
 VIEWER_CAMERAS, TRAINING_CAMERAS = 20, 32
 """Cameras that a model file keeps: of the test split, or of training if there is none, and others of training."""
@@ -137,7 +138,9 @@ class GaussianSplatting:
         if c.alpha_weight:
             loss = loss + c.alpha_weight * target.alpha_error(alpha)
         clamped = count_clamped(self.config.model.scale_space, posed.scales)
-        shows_all = target.shows_all and not self.config.model.opacity_head  # else opacity 0 at this time hides some
+        shows_all = (
+            target.facts.shows_all and not self.config.model.opacity_head
+        )  # else opacity 0 at this time hides some
         return ViewLoss(loss, rgb, clamped, info, shows_all)
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
@@ -231,7 +234,7 @@ class GaussianSplatting:
         """Those of the support, once for the pose and the regularizers."""
         if not (self.schedule.deforms(step) and len(self.model.deformation)):
             return None
-        return self.model.support.motions(self.model.deformation, points.means, points.means.new_tensor(t))
+        return self.model.support.motions(self.model.deformation, points.means, points.means.new_full((), t))
 
     def _regularizers(
         self, posed: PosedGaussians, motions: Any, points: CanonicalPoints, t: float, moment: Moment
@@ -240,7 +243,7 @@ class GaussianSplatting:
         pruning = self.schedule.prunes_hidden(moment.step, several_per_time=self.several_per_time)
         terms = list(self.config.density.regularizers(posed.opacities, posed.scales, pruning=pruning).values())
         if motions is not None:
-            support, time = self.model.support, posed.means.new_tensor(t)
+            support, time = self.model.support, posed.means.new_full((), t)
             terms += support.regularizers(motions, points, time, moment.generator).values()
             moved = support.points(points.means)
             for layer in self.model.deformation:

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import gsplat
 import numpy as np
 import pytest
 import torch
@@ -54,6 +56,51 @@ def test_gpu_and_cpu_draw_the_same_image_and_gradients() -> None:
 CONFIGS = {name: small_config(model=model, alpha_weight=0.1) for name, model in MODELS.items()}
 CONFIGS |= {f"{name}, mcmc": config.updated(density_strategy="mcmc") for name, config in CONFIGS.items()}
 CONFIGS["default"] = shrunk(preset(DEFAULT)).updated(batch_size=2, ema_fraction=0.25, checkpoint_every=0)
+
+
+@needs_gpu
+@pytest.mark.parametrize("precision", ["float32", "tf32", "bf16"])
+@pytest.mark.parametrize("name", ["mixed on nodes", "mixed on gaussians"])
+def test_a_step_waits_for_gsplat_alone(name: str, precision: str, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """gsplat reads the number of splats in tiles."""
+    config = small_config(
+        model=MODELS[name], device="cuda", gpu_precision=precision, static_fraction=0.0, refine_every_fraction=0.0,
+        log_every=1000, steps=60, alpha_weight=0.1, window_full_fraction=0.0, absolute_gradients=True,
+    )  # fmt: skip
+    trainer, draw = Trainer(config, load_scene(data)), gsplat.rasterization
+
+    def waiting(*arguments: Any, **options: Any) -> Any:
+        torch.cuda.set_sync_debug_mode("default")
+        drawn = draw(*arguments, **options)
+        torch.cuda.set_sync_debug_mode("error")
+        return drawn
+
+    monkeypatch.setattr(gsplat, "rasterization", waiting)
+    for _ in range(len(trainer.scene.splits["train"])):  # copies the images
+        trainer.step()
+    try:
+        torch.cuda.set_sync_debug_mode("error")
+        trainer.step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert np.isfinite(trainer.evaluate("test").__next__().metrics.psnr)
+
+
+@needs_gpu
+@pytest.mark.parametrize("name", MODELS)
+def test_gradients_of_a_step_are_those_of_the_cpu(name: str, data: Path) -> None:
+    """Of layers, skinning, loss and rendering together."""
+    found = []
+    for device in ("cpu", "cuda"):
+        config = small_config(model=MODELS[name], device=device, static_fraction=0.0, window_full_fraction=0.0)
+        trainer = Trainer(config, load_scene(data))
+        trainer.step()
+        parameters = splatting(trainer).model.named_parameters()
+        found.append({key: p.grad.cpu() for key, p in parameters if p.grad is not None})
+    largest = max(float(grad.abs().max()) for grad in found[0].values())
+    for key, grad in found[0].items():
+        size = max(float(grad.abs().max()), 1e-3 * largest)
+        assert float((found[1][key] - grad).abs().max()) <= 10 * tolerance("cuda.gradient") * size, key
 
 
 @needs_gpu

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 from msdgs_train.datasets import load_scene
+from msdgs_train.engine.meters import TrainingDiverged
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.engine.run import Observer, fit
-from msdgs_train.engine.trainer import StepResult, Trainer, TrainingDiverged
+from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.systems import gaussian_splatting as system_module
 from tests.support.training_scene import (

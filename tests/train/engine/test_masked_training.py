@@ -18,7 +18,8 @@ from msdgs_train.evaluation.evaluate import scores
 from msdgs_train.evaluation.metrics import MAX_PSNR, image_metrics, masked_psnr, psnr
 from msdgs_train.evaluation.perceptual import PerceptualMetrics
 from msdgs_train.losses.photometric import photometric_loss, ssim
-from msdgs_train.systems.base import Moment, Target, ViewLoss
+from msdgs_train.systems.base import Moment, ViewLoss
+from msdgs_train.systems.targets import ImageFacts, Target
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import FEW, SIZE, small_config, splatting, trained, write_scene
 
@@ -134,18 +135,17 @@ def test_alpha_and_training_error_are_over_the_pixels_that_count():
     alpha = torch.where(MASK, 0, 200).to(torch.uint8)
     target = Target(rgb_target, alpha, MASK)
     assert float(target.alpha_error(torch.where(MASK, 0.25, 1.0))) == pytest.approx(0.25)
-    assert target.squared_error(rgb) == pytest.approx(float((rgb - rgb_target).square()[MASK].mean()))
+    assert float(target.squared_error(rgb)) == pytest.approx(float((rgb - rgb_target).square()[MASK].mean()))
 
 
 def test_a_masked_border_may_show_anything():
-    alpha = torch.zeros(20, 31, dtype=torch.uint8)
-    alpha[8:12, 8:12] = 255
-    border = torch.ones_like(MASK)
+    rgba = np.zeros((20, 31, 4), np.uint8)
+    rgba[8:12, 8:12, 3] = 255
+    border = np.ones((20, 31), np.bool_)
     border[0] = False
-    shown = Target(torch.zeros(20, 31, 3), alpha)
-    assert shown.shows_all
-    assert shown._replace(mask=MASK).shows_all
-    assert not shown._replace(mask=border).shows_all
+    assert ImageFacts.of(rgba).shows_all
+    assert ImageFacts.of(rgba, MASK.numpy()).shows_all
+    assert not ImageFacts.of(rgba, border).shows_all
 
 
 def test_the_trainer_gives_masks_to_the_loss_and_to_the_metrics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
