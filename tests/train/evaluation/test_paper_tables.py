@@ -80,7 +80,7 @@ def config_of(name: str, variant: str) -> TrainConfig | None:
 @pytest.mark.parametrize("variant", ["published", "small"])
 def test_systems_can_be_read(variant: str) -> None:
     read = {name for name in contents("systems") if config_of(name, variant)}
-    assert {"deformgs", "4dgs", "msdgs-mlp", "msdgs-plane", "msdgs-mlp no weights", "msdgs-mlp K=10"} <= read
+    assert {"deformgs", "4dgs", "sc-gs", "msdgs-mlp", "msdgs-plane", "msdgs-mlp no weights", "msdgs-mlp K=10"} <= read
 
 
 def test_systems_have_the_published_parameters() -> None:
