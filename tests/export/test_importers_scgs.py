@@ -7,13 +7,15 @@ import pytest
 import torch
 from rich.console import Console
 
+from msdgs_export.bake import bake
 from msdgs_export.importers.detect import detect_format
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.runs.model import write_model
+from msdgs_export.trajectories.poses import ExactPoses
 from msdgs_train.gaussians.model_file import load_model
 from tests.support import scgs_reference as reference
-from tests.support.models import export_scene
-from tests.support.scgs_models import write_scgs
+from tests.support.models import SCENE, export_scene
+from tests.support.scgs_models import scgs_model, write_scgs
 from tests.support.tolerances import assert_close, tolerance
 
 QUIET = Console(quiet=True)
@@ -36,6 +38,15 @@ def test_a_run_is_imported_and_exported(tmp_path: Path):
                 assert_close(posed[name].detach(), stored[f"posed{index}.{name}"], "scgs.pose")
     exported = export_scene(tmp_path / "model.pt", tmp_path / "scene.onnx", times=4)
     assert exported.measured_error["means"] <= tolerance("export.relative")
+
+
+def test_plans_that_are_fitted_see_the_poses_of_the_model():
+    model = scgs_model()
+    exact = ExactPoses(bake(model, SCENE, "0" * 64)).at(0.6)
+    with torch.no_grad():
+        posed = model.double().pose(0.6)
+    expected = torch.cat([posed.means, posed.scales, posed.quats], dim=1)
+    assert_close(exact, expected, "scgs.exact")
 
 
 def test_a_run_without_local_frames_moves_by_translations(tmp_path: Path):

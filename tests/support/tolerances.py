@@ -58,6 +58,7 @@ TABLE = (
     # SC-GS's own modules, run in float64
     Row("scgs.pose", 1e-4, "float32 of a network of eight layers and of sums of size 10"),
     Row("scgs.losses.relative", 1e-3, "five steps amplify roundings of float64; fitted rotations are sums of products"),
+    Row("scgs.exact", 1e-6, "float64, from quaternions of size 1 that were normalized in float32"),
     Row("scgs.rendered", 1e-4, "poses that are 1e-6 off, rounded differently by onnxruntime; colors of size 1"),
     Row("scgs.fitted", 1e-3, "as scgs.losses: Adam divides by gradients, however small"),
     # gradients, relative to the largest entry of their kind
