@@ -54,6 +54,16 @@ SMALL = replace(
 register_system(
     "sc-gs-small",
     "SC-GS for CPUs: 256 control nodes and a smaller network",
-    PRESET.updated(model=SMALL, steps=20_000, init_num_pts=8_000, max_gaussians=None, init_min_views=0.5),
+    PRESET.updated(
+        model=SMALL,
+        steps=10_000,
+        init_num_pts=8_000,
+        max_gaussians=None,
+        init_min_views=0.5,
+        refine_every_fraction=1 / 400,
+        grow_grad2d=5e-4,
+        node_refine_every_fraction=1 / 25,
+        gaussians_per_node=16,
+    ),
     SCGS,
 )

@@ -1,8 +1,9 @@
 """Settings of the stages and losses of SC-GS."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from msdgs_train.settings import SystemConfig
+from msdgs_train.settings import SystemConfig, optional
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,9 @@ class SCGSSettings(SystemConfig):
     """Fraction of the first stage between rounds of density control."""
     node_reset_every_fraction: float = 3_000 / 10_000
     """Fraction of the first stage between resets of opacities."""
+    gaussians_per_node: Annotated[int | None, optional("INT")] = None
+    """Upper bound of the Gaussians of the first stage, per node; if not given 16 with sparse points of the dataset, and
+    --max-gaussians without."""
     warm_up_fraction: float = 3_000 / 80_000
     """First fraction of the second stage, in which motion isn't trained."""
     densify_nodes_fraction: float = 10_000 / 80_000
@@ -43,6 +47,7 @@ class SCGSSettings(SystemConfig):
         self.require_weights("elastic_weight", "acceleration_weight", "node_rigidity_weight")
         self.require_positive("rigidity_weight_init", "rigidity_weight_final", "node_stage_fraction")
         self.require_positive("node_choice_fraction", "network_until_fraction")
+        self.require_positive_or_none("gaussians_per_node")
         self.require(("node_stage_fraction",), "above 0 and below 1", lambda value: value < 1)
 
     def rigidity_weight(self, part: float) -> float:

@@ -88,8 +88,9 @@ class SCGS(GaussianSplatting):
     def _enter(self) -> None:
         """Follow the schedule of the stage that the nodes are in, with density control from its start."""
         self.schedule, most = self.stages[self.is_second], self.max_gaussians
-        if not self.is_second and self.scene.points is not None:
-            most = max(min(most, MOST_PER_NODE * self.support.config.num_nodes), self.size)
+        per_node = self.settings.gaussians_per_node or (MOST_PER_NODE if self.scene.points is not None else None)
+        if not self.is_second and per_node:
+            most = max(min(most, per_node * self.support.config.num_nodes), self.size)
         self.density = self.new_density(self.schedule, most)
 
     @torch.no_grad()
