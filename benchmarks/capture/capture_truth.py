@@ -37,7 +37,8 @@ class Errors(NamedTuple):
 
 def main(
     parts: tuple[Part, ...] = ("moving", "fixed"),
-    frames: int = 36,
+    frames: int = 48,
+    arc: float = 60.0,
     width: int = 320,
     rig_frames: int = 16,
     threads: int = 1,
@@ -50,12 +51,14 @@ def main(
 
     python -m benchmarks.capture.capture_truth --video hand.mp4 --poses precomputed.json
 
-    A camera moves around moving toys in front of a poster that swings, with and without masks of what moves; six
-    cameras stand around the toys. Centers' errors are percentages of the diagonal of the box around the true centers.
+    A camera moves around moving toys in front of a poster that swings: poses from all matches, from those on what
+    stands still, and also without features where masks say that something moves. Six cameras stand around the toys.
+    Centers' errors are percentages of the diagonal of the box around the true centers.
 
     Args:
         parts: Clips: a moving camera, six fixed ones.
         frames: Frames of the moving camera's clip.
+        arc: Degrees of its path.
         width: Pixels of the clips.
         rig_frames: Frames of each fixed camera.
         threads: Threads of COLMAP; with one the figures repeat.
@@ -69,29 +72,32 @@ def main(
     made = table(f"{frames} frames of {width} px, seed {seed}, {threads} thread(s)", *COLUMNS)
     with scratch_folder() as folder:
         if "moving" in parts:
-            clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=30.0, seed=seed)
+            clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=arc, seed=seed)
             share = f"{clip.moving.mean():.0%} moves"
-            for name, found, taken in _with_and_without(clip.file, folder / "clip", seed, threads):
-                made.add_row(f"moving camera, {share}, {name}", *_row(found, taken, clip.camera_to_world, clip.times))
+            for name, found, taken in _three_ways(clip.file, folder / "clip", seed, threads):
+                made.add_row(f"arc of {arc:g}°, {share}, {name}", *_row(found, taken, clip.camera_to_world, clip.times))
         if "fixed" in parts:
             rig = fixed_camera_clips(folder, width=width, frames=rig_frames, offsets=OFFSETS, seed=seed)
             off, cells = rig_row(rig, folder / "rig", seed, threads)
             made.add_row(f"six fixed cameras, offsets within {off:.2f} frames", *cells)
         if video is not None and poses is not None:
             given = read_poses(poses)
-            for name, found, taken in _with_and_without(video, folder / "video", seed, threads):
+            for name, found, taken in _three_ways(video, folder / "video", seed, threads):
                 made.add_row(f"{video.name}, {name}", *_row(found, taken, given, None))
     report_console().print(machine(), made)
     return 0
 
 
-def _with_and_without(video: Path, folder: Path, seed: int, threads: int) -> list[tuple[str, Poses, FrameSet]]:
+def _three_ways(video: Path, folder: Path, seed: int, threads: int) -> list[tuple[str, Poses, FrameSet]]:
     images = folder / "images"
     taken = extract_frames([video], images)
-
+    everything = find_poses(
+        images, taken, folder / "all", seed=seed, threads=threads, all_matches=True, progress=_progress
+    )
     masked = find_masked_poses(images, taken, _run_in(folder), seed=seed, threads=threads)
-    first = Poses.load(folder / step_names()[0], taken)
-    return [("without masks", first, taken), (f"masks, {masked.passes} passes", masked.poses, taken)]
+    static = Poses.load(folder / step_names()[0], taken)
+    found = {"all matches": everything, "what stands still": static, f"masks, {masked.passes} passes": masked.poses}
+    return [(name, poses, taken) for name, poses in found.items()]
 
 
 def _run_in(folder: Path) -> Keep:
@@ -178,7 +184,7 @@ def self_test() -> int:
         np.testing.assert_allclose(errors, 0, atol=1e-4)
     found[0, :3, :3] = found[1, :3, :3]
     assert errors_of(found, truth).rotations.max() > 1
-    return main(frames=16, width=160, rig_frames=4)
+    return main(frames=16, arc=30.0, width=160, rig_frames=4)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""The images of a folder as frames of one camera, upright as their EXIF orientation says."""
+"""The images of a folder as frames of one camera, upright as their EXIF orientation says, and in sRGB."""
 
+import io
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import OpenImageIO as oiio
@@ -16,6 +18,8 @@ from msdgs_train.datasets.common.readers import DatasetInvalid
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif", ".dng")
 """Of files that are meant as images, of which those that can't be read are refused."""
+UNREAD = {".heic", ".heif", ".avif", ".dng"}
+"""Of them, those that need a decoder that OpenImageIO's packages don't have."""
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp", ".gif")
 RATE = 30.0
 """Images per second, as folders of images say nothing of it."""
@@ -77,34 +81,69 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def read_image(file: Path) -> np.ndarray:
-    """Read uint8 RGB [H, W, 3], upright, transparent parts black. Raises `CaptureFailed`."""
+    """Read uint8 sRGB [H, W, 3], upright, transparent parts black. Raises `CaptureFailed`."""
     try:
         rgba = read_rgba(file)
     except DatasetInvalid as error:
-        raise CaptureFailed(file, f"{error.problem}. Convert it to JPEG or PNG") from None
+        raise _unreadable(file, error.problem) from None
     if (rgba[..., 3] < 255).any():
         rgba[..., :3] = (255 * composite(rgba, (0.0, 0.0, 0.0)) + 0.5).astype(np.uint8)
-    return np.ascontiguousarray(_turn(_header(file))(rgba[..., :3]))
+    header = _header(file)
+    shown = ORIENTATIONS.get(header.orientation, lambda pixels: pixels)(rgba[..., :3])
+    return in_srgb(np.ascontiguousarray(shown), header.profile)
+
+
+def in_srgb(pixels: np.ndarray, profile: bytes) -> np.ndarray:
+    """Convert uint8 RGB [H, W, 3] from the colors of an ICC profile, such as Display P3, to sRGB.
+
+    Without a profile, or with one that can't be used, the pixels are taken to be sRGB.
+    """
+    from PIL import Image, ImageCms
+
+    if not profile:
+        return pixels
+    image = Image.fromarray(pixels)
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), inPlace=True)
+    except (OSError, ImageCms.PyCMSError):  # not a profile, or one of gray or CMYK, which the reader has converted
+        return pixels
+    return np.array(image)
+
+
+class _Header(NamedTuple):
+    """What an image says of itself."""
+
+    width: int
+    height: int
+    orientation: int  # EXIF's number
+    profile: bytes  # ICC, empty if there is none
 
 
 @cache
-def _header(file: Path) -> tuple[int, int, int]:
-    """Width, height and EXIF orientation."""
+def _header(file: Path) -> _Header:
     reader = oiio.ImageInput.open(str(file))
     if reader is None:
-        raise CaptureFailed(file, f"can't be read: {oiio.geterror().splitlines()[0]}. Convert it to JPEG or PNG")
+        raise _unreadable(file, f"can't be read: {oiio.geterror().splitlines()[0]}")
     spec = reader.spec()
     reader.close()
-    return spec.width, spec.height, int(spec.getattribute("Orientation") or 1)
+    profile = spec.getattribute("ICCProfile")
+    stored = b"" if profile is None else np.asarray(profile, np.uint8).tobytes()
+    return _Header(spec.width, spec.height, int(spec.getattribute("Orientation") or 1), stored)
 
 
-def _turn(header: tuple[int, int, int]) -> Callable[[np.ndarray], np.ndarray]:
-    return ORIENTATIONS.get(header[2], lambda pixels: pixels)
+def _unreadable(file: Path, problem: str) -> CaptureFailed:
+    if file.suffix.lower() in UNREAD:
+        kind = file.suffix[1:].upper()
+        return CaptureFailed(
+            file, f"is {kind}, which isn't read: convert all images to JPEG or PNG, of their full size"
+        )
+    return CaptureFailed(file, f"{problem}. Convert it to JPEG or PNG")
 
 
 def _shown_size(file: Path) -> tuple[int, int]:
-    width, height, orientation = _header(file)
-    return (height, width) if orientation >= 5 else (width, height)
+    header = _header(file)
+    return (header.height, header.width) if header.orientation >= 5 else (header.width, header.height)
 
 
 def _times(names: list[str]) -> list[float]:

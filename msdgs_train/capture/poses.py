@@ -2,6 +2,8 @@
 
 A moving camera has a view for each of its frames. The frames of a camera that stands still share one pose: its view is
 the background, the median of its frames, which is free of what moves. Views of one camera share its intrinsics.
+
+A model is made of matches on what stands still (`static_tracks`), and then refined with all that agree with its poses.
 """
 
 from dataclasses import dataclass
@@ -52,13 +54,15 @@ def find_poses(
     masks: Path | None = None,
     seed: int = 0,
     threads: int | None = None,
+    all_matches: bool = False,
     progress: Progress | None = None,
 ) -> Poses:
     """Find the poses of frames in the folder `images`; `workspace` takes the database, the model and `geometry.npz`.
 
     `masks` holds an image of each frame's name, white where no features are taken; backgrounds need none. One thread
-    gives the same poses each time. `progress` is called with the stage, what is done and the total. Raises
-    `CaptureFailed` if COLMAP ends with an error; without any model the result has no registered frames.
+    gives the same poses each time. With `all_matches` those on what moves count as well, for comparison. `progress` is
+    called with the stage, what is done and the total. Raises `CaptureFailed` if COLMAP ends with an error; without any
+    model the result has no registered frames.
     """
     workspace = workspace.absolute()
     workspace.mkdir(parents=True, exist_ok=True)
@@ -75,7 +79,8 @@ def find_poses(
         if own
     )
     feature_masks = None if masks is None else _feature_masks(masks, workspace / FEATURE_MASKS, views)
-    job = PosesJob(str(workspace), cameras, tuple(matched_pairs(views)), feature_masks, seed, threads or ALL_PROCESSORS)
+    pairs = tuple(matched_pairs(views))
+    job = PosesJob(str(workspace), cameras, pairs, feature_masks, seed, threads or ALL_PROCESSORS, all_matches)
     run_sfm(job, images, progress)
     return Poses.load(workspace, frames)
 

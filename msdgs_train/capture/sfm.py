@@ -19,6 +19,7 @@ import pycolmap
 
 from msdgs_train.capture.rotation import Pair, beyond_rotation
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, UndistortedJob
+from msdgs_train.capture.sfm_static import write_static
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 
 T = TypeVar("T")
@@ -44,6 +45,12 @@ WARNINGS_ONLY = 2
 TOLERANCE = 1 / 700
 """Pixels of error, per pixel of the long side, that a match and a point may have; at least one. COLMAP's are four
 pixels, which in a small image is the motion of an object between two frames."""
+REFINEMENTS, ITERATIONS = 3, 30
+"""Of a model, and of the bundle adjustment in each."""
+LOSS_SCALE = 0.25
+"""Of Cauchy's loss, in tolerances: points at rest are ten times closer, and some that move are still among them."""
+MIN_ANGLE = 1.5
+"""Degrees between the rays of a point that is kept, as COLMAP has it."""
 
 
 def main() -> None:
@@ -71,7 +78,7 @@ def find(job: PosesJob) -> None:
     extract(job, database)
     match(job, database)
     models, method = mapped(job, database, workspace)
-    largest = models[0] if models else pycolmap.Reconstruction()
+    largest = refined(models[0], job, database) if models else pycolmap.Reconstruction()
     _color(largest, job.cameras)
     _spread_to_frames(largest, job.cameras)
     sparse = workspace / "sparse"
@@ -107,9 +114,7 @@ def match(job: PosesJob, database: Path) -> None:
     """Match the pairs and write their two-view geometries."""
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     options.guided_matching = all(camera.frames is not None for camera in job.cameras)
-    geometry = pycolmap.TwoViewGeometryOptions()
-    geometry.ransac.random_seed = job.seed
-    geometry.ransac.max_error = _tolerance(database)
+    geometry = _geometry_options(job, database)
     chosen = Path(job.workspace) / "pairs.txt"
     done = 0
     for pairs in _batches(job.pairs, 100):
@@ -123,32 +128,64 @@ def match(job: PosesJob, database: Path) -> None:
 
 
 def mapped(job: PosesJob, database: Path, workspace: Path) -> tuple[list[pycolmap.Reconstruction], str]:
-    """The models, the largest first, of the incremental mapper or of the global one, whichever makes the larger one."""
+    """The models, the largest first, and the mapper that made them.
+
+    Of moving cameras, the matches are those on what stands still, and if these don't suffice, all. The mapper is the
+    incremental one, or the global one if that makes a larger model.
+    """
     total = sum(len(camera.names) for camera in job.cameras)
-    scratch = workspace / "models"
+    only_fixed = all(camera.frames is not None for camera in job.cameras)
+    models, method = [], ""
+    if not (only_fixed or job.all_matches):
+        report("what stands still", 0, total)
+        static = workspace / "static.db"
+        write_static(database, static, job.cameras, _geometry_options(job, database))
+        models, method = _mapped_by(job, static, workspace / "models", total)
+        static.unlink()
+    if not models or _size(models[0])[0] < ENOUGH * total:
+        others, by = _mapped_by(job, database, workspace / "models", total, try_global=only_fixed)
+        if others and (not models or _size(others[0]) > _size(models[0])):
+            models, method = others, by
+    report("mapping", total, total)
+    return models, method
+
+
+def _mapped_by(
+    job: PosesJob, database: Path, scratch: Path, total: int, *, try_global: bool = False
+) -> tuple[list[pycolmap.Reconstruction], str]:
+    """The models of the incremental mapper, or those of the global one if its largest is larger."""
     models, method = _incremental(job, database, scratch, total), "incremental"
     size = _size(models[0])[0] if models else 0
-    if total > 1 and (size < ENOUGH * total or all(camera.frames is not None for camera in job.cameras)):
+    if total > 1 and (size < ENOUGH * total or try_global):
         report("mapping again", 0, total)
         of_global = _global(job, database, scratch)
         if of_global and (not models or _size(of_global[0]) > _size(models[0])):
             models, method = of_global, "global"
     shutil.rmtree(scratch, ignore_errors=True)
-    report("mapping", total, total)
     return models, method
 
 
+def refined(model: pycolmap.Reconstruction, job: PosesJob, database: Path) -> pycolmap.Reconstruction:
+    """The model with points of all matches that agree with its poses, and poses, lens and points adjusted to them."""
+    tolerance, scratch = _tolerance(database), database.parent / "points"
+    options = _incremental_options(job, tolerance)
+    adjustment = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    adjustment.ceres.loss_function_scale = LOSS_SCALE * tolerance
+    adjustment.ceres.solver_options.max_num_iterations = ITERATIONS
+    adjustment.ceres.solver_options.num_threads = job.threads
+    for number in range(REFINEMENTS):
+        report("refining", number, REFINEMENTS)
+        scratch.mkdir(exist_ok=True)
+        model = pycolmap.triangulate_points(model, database, Path(job.cameras[0].folder), scratch, options=options)
+        pycolmap.bundle_adjustment(model, adjustment)
+    pycolmap.ObservationManager(model).filter_all_points3D(tolerance, MIN_ANGLE)
+    shutil.rmtree(scratch, ignore_errors=True)
+    return model
+
+
 def _incremental(job: PosesJob, database: Path, scratch: Path, total: int) -> list[pycolmap.Reconstruction]:
-    options = pycolmap.IncrementalPipelineOptions(
-        num_threads=job.threads, random_seed=job.seed, min_model_size=MIN_MODEL, extract_colors=False
-    )
-    options.max_extra_param = MAX_EXTRA_PARAMETER
-    options.mapper.random_seed = options.triangulation.random_seed = job.seed
-    options.mapper.num_threads = job.threads
-    tolerance = _tolerance(database)
-    options.mapper.init_max_error = options.mapper.filter_max_reproj_error = tolerance
-    options.mapper.abs_pose_max_error = 3 * tolerance
-    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = tolerance
+    options = _incremental_options(job, _tolerance(database))
     added = 0
 
     def count() -> None:
@@ -161,6 +198,19 @@ def _incremental(job: PosesJob, database: Path, scratch: Path, total: int) -> li
         database, scratch, scratch, options, initial_image_pair_callback=count, next_image_callback=count
     )
     return _sorted(models)
+
+
+def _incremental_options(job: PosesJob, tolerance: float) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(
+        num_threads=job.threads, random_seed=job.seed, min_model_size=MIN_MODEL, extract_colors=False
+    )
+    options.max_extra_param = MAX_EXTRA_PARAMETER
+    options.mapper.random_seed = options.triangulation.random_seed = job.seed
+    options.mapper.num_threads = job.threads
+    options.mapper.init_max_error = options.mapper.filter_max_reproj_error = tolerance
+    options.mapper.abs_pose_max_error = 3 * tolerance
+    options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = tolerance
+    return options
 
 
 def _global(job: PosesJob, database: Path, scratch: Path) -> list[pycolmap.Reconstruction]:
@@ -279,6 +329,13 @@ def _beyond_rotation(database: Path) -> float:
             ]
             pairs.append(Pair(*places))
     return long_side * beyond_rotation(pairs)
+
+
+def _geometry_options(job: PosesJob, database: Path) -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job.seed
+    options.ransac.max_error = _tolerance(database)
+    return options
 
 
 def _tolerance(database: Path) -> float:

@@ -43,6 +43,8 @@ class PosesJob:
     seed: int
     threads: int
     """-1: all processors."""
+    all_matches: bool = False
+    """Map with all matches from the start, also those on what moves."""
     kind: Literal["poses"] = "poses"
 
 

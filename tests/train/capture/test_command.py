@@ -21,7 +21,7 @@ from tests.support.processes import ROOT
 from tests.train.capture.clips import pictures, write_clip
 from tests.train.capture.conftest import NAME, PLANTED, Captured
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("captured")]
 
 
 def test_a_clip_becomes_a_scene_with_its_times(captured: Captured):

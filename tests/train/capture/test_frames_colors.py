@@ -1,12 +1,17 @@
-"""Videos of other bits, ranges, matrices, primaries and transfer functions, against formulas in float64."""
+"""Videos of other bits, ranges, matrices, primaries and transfer functions, and images with ICC profiles, against
+formulas in float64."""
 
+import struct
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import pytest
+from PIL import Image, ImageCms
 
+from msdgs_train.capture.image_source import read_image
 from msdgs_train.datasets.common.video_colors import HLG, KNEE, PQ, as_srgb
 
 LUMA = {5: (0.299, 0.114), 1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
@@ -14,6 +19,9 @@ LUMA = {5: (0.299, 0.114), 1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
 BT2020_TO_BT709 = [[1.660491, -0.587641, -0.072850], [-0.124550, 1.132900, -0.008349], [-0.018151, -0.100579, 1.118730]]
 """BT.2087."""
 P3_TO_BT709 = [[1.224940, -0.224940, 0], [-0.042057, 1.042057, 0], [-0.019638, -0.078636, 1.098274]]
+
+PRIMARIES = (b"rXYZ", b"gXYZ", b"bXYZ")
+"""Names in an ICC profile."""
 
 
 def frame(layout: str, yuv: tuple[int, ...], **colors: int) -> Any:
@@ -109,3 +117,35 @@ def test_hdr_is_compressed_without_steps_and_its_peak_is_white():
     assert gray[0] == 0
     assert gray[-1] == 255
     assert all(0 <= step <= 5 for step in np.diff(gray))
+
+
+def display_p3() -> bytes:
+    """The ICC profile of sRGB with the primaries of P3."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    places = [struct.unpack(">I", profile[at + 4 : at + 8])[0] + 8 for at in map(profile.index, PRIMARIES)]
+    to_xyz = np.array([struct.unpack(">3i", profile[place : place + 12]) for place in places]).T
+    for place, column in zip(places, (to_xyz @ P3_TO_BT709).T, strict=True):
+        profile[place : place + 12] = struct.pack(">3i", *np.round(column).astype(int))
+    return bytes(profile)
+
+
+def shown(pixels: np.ndarray, file: Path, profile: bytes | None) -> np.ndarray:
+    """What is read of an image that is written with a profile."""
+    Image.fromarray(pixels).save(file, icc_profile=profile)
+    return read_image(file)
+
+
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_images_are_converted_from_their_icc_profile(tmp_path: Path, ending: str):
+    pixels = np.array([list(product((60, 150, 230), repeat=3))], np.uint8)
+    found = shown(pixels, tmp_path / f"a.{ending}", display_p3()).astype(float)
+    wanted = encoded(decoded(pixels / 255) @ np.transpose(P3_TO_BT709))
+    assert np.abs(wanted - pixels).max() > 20
+    assert np.abs(found - wanted).max() <= 2  # lcms computes with 8 bits
+
+
+def test_images_without_a_profile_of_rgb_are_taken_for_srgb(tmp_path: Path):
+    pixels = np.random.default_rng(0).integers(0, 256, (8, 9, 3), np.uint8)
+    lab = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
+    for name, profile in {"none": None, "of Lab": lab, "damaged": b"-" * 200}.items():
+        np.testing.assert_array_equal(shown(pixels, tmp_path / f"{name}.tif", profile), pixels)

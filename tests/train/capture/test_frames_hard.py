@@ -71,6 +71,8 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a folder without images": (lambda folder: folder_of(folder, "none", "a.txt"), "none: has no images in it"),
     "a folder of videos": (lambda folder: folder_of(folder, "clips", "a.mp4"), r"but videos such as a\.mp4"),
     "a folder of folders": (lambda folder: folder_of(folder, "rig", "cam0"), "but folders such as cam0"),
+    "images of a phone": (lambda folder: folder_of(folder, "phone", "a.HEIC"), r"a\.HEIC: is HEIC, .* convert .* JPEG"),
+    "a damaged image": (lambda folder: folder_of(folder, "bad", "a.png"), r"a\.png: can.t be read: .* Convert it"),
     "images of two sizes": (unequal, r"2\.png: is 96×62, but 1\.png is 96×64: give images of one size"),
     "all black": (lambda folder: write_clip(folder / "a.mp4", [np.zeros((64, 96, 3), np.uint8)] * 9), "is black"),
     "all gray": (lambda folder: write_clip(folder / "a.mp4", [np.full((64, 96, 3), 99, np.uint8)] * 9), "of one color"),

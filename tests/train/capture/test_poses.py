@@ -4,7 +4,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,36 +20,12 @@ from msdgs_train.capture.image_files import read_color, read_gray, write_image
 from msdgs_train.capture.moving import find_moving
 from msdgs_train.capture.poses import Poses, find_poses
 from msdgs_train.datasets import SceneData, load_scene
-from tests.support.clips import Clip, fixed_camera_clips, moving_camera_clip
+from tests.support.clips import Clip, fixed_camera_clips
 from tests.support.training_scene import small_config, splatting, trained
+from tests.train.capture.conftest import COUNT, Captured
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("captured poses")]
-WIDTH, FRAMES, ARC = 224, 14, 16.0
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("captured")]
 STEPS = 2
-
-
-class Captured(NamedTuple):
-    clip: Clip
-    images: Path
-    frames: FrameSet
-    first: Poses
-    masks: Path
-    poses: Poses
-    data: Path
-
-
-@pytest.fixture(scope="session")
-def captured(tmp_path_factory: pytest.TempPathFactory) -> Captured:
-    """A moving camera, a third of whose image moves."""
-    folder = tmp_path_factory.mktemp("captured")
-    clip = moving_camera_clip(folder / "clip.mp4", width=WIDTH, frames=FRAMES, arc=ARC)
-    images, masks, data = (folder / name for name in ("images", "masks", "data"))
-    frames = extract_frames([clip.file], images)
-    first = find_poses(images, frames, folder / "first", threads=1)
-    find_moving(images, frames, first, masks)
-    poses = find_poses(images, frames, folder / "again", masks=masks, threads=1)
-    write_dataset(images, frames, poses, masks, data)
-    return Captured(clip, images, frames, first, masks, poses, data)
 
 
 def worst_turn(captured: Captured, poses: Poses) -> float:
@@ -63,14 +38,16 @@ def worst_turn(captured: Captured, poses: Poses) -> float:
     return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))).max())
 
 
-def test_masks_of_what_moves_make_the_poses_better(captured: Captured):
-    assert len(captured.poses.registered) == len(captured.frames.frames) == FRAMES
-    assert captured.poses.summary.error < captured.first.summary.error
-    assert worst_turn(captured, captured.poses) < worst_turn(captured, captured.first)
+def test_matches_on_what_moves_would_make_the_poses_worse(captured: Captured, tmp_path: Path):
+    poses = Poses.load(captured.step("poses"), captured.frames)
+    others = find_poses(captured.images, captured.frames, tmp_path, threads=1, all_matches=True)
+    assert len(poses.registered) == len(captured.frames.frames) == COUNT
+    assert poses.summary.error < others.summary.error
+    assert worst_turn(captured, poses) < worst_turn(captured, others)
 
 
 def test_most_of_what_is_masked_moves_and_most_of_what_moves_is_masked(captured: Captured):
-    masks = np.stack([read_gray(captured.masks / frame.name) > 0 for frame in captured.frames.frames])
+    masks = np.stack([read_gray(captured.found.masks / frame.name) > 0 for frame in captured.frames.frames])
     moving = captured.clip.moving
     assert moving.mean() > 1 / 3
     assert (masks & moving).sum() > masks.sum() / 2
@@ -78,9 +55,10 @@ def test_most_of_what_is_masked_moves_and_most_of_what_moves_is_masked(captured:
 
 
 def test_one_thread_and_seed_give_the_same_poses(captured: Captured, tmp_path: Path):
-    again = find_poses(captured.images, captured.frames, tmp_path, masks=captured.masks, threads=1)
-    assert again.registered == captured.poses.registered
-    np.testing.assert_array_equal(again.summary.camera_to_world, captured.poses.summary.camera_to_world)
+    poses = Poses.load(captured.step("poses"), captured.frames)
+    again = find_poses(captured.images, captured.frames, tmp_path, threads=1)
+    assert again.registered == poses.registered
+    np.testing.assert_array_equal(again.summary.camera_to_world, poses.summary.camera_to_world)
 
 
 def test_the_dataset_is_a_colmap_folder_with_the_times_of_the_frames(captured: Captured):
@@ -98,7 +76,7 @@ def test_the_dataset_is_a_colmap_folder_with_the_times_of_the_frames(captured: C
     program = "import pycolmap, sys; print(pycolmap.Reconstruction(sys.argv[1]).num_reg_images())"
     sparse = captured.data / "sparse" / "0"
     done = subprocess.run([sys.executable, "-c", program, sparse], capture_output=True, text=True, check=True)
-    assert int(done.stdout) == FRAMES
+    assert int(done.stdout) == COUNT
 
 
 def test_undistorted_images_have_no_black_borders_and_masks_their_size(captured: Captured):
@@ -111,8 +89,9 @@ def test_undistorted_images_have_no_black_borders_and_masks_their_size(captured:
 
 
 def test_nothing_that_is_written_has_a_path_or_metadata(captured: Captured):
-    files = [file for file in captured.data.rglob("*") if file.is_file()]
-    assert len(files) > 2 * FRAMES
+    folders = [captured.data / name for name in ("images", MOTION_MASKS, "sparse")]
+    files = [file for folder in folders for file in folder.rglob("*") if file.is_file()]
+    assert len(files) > 2 * COUNT
     for file in files:
         content = file.read_bytes()
         assert str(captured.data.parent).encode() not in content, file
@@ -126,7 +105,7 @@ def test_nothing_that_is_written_has_a_path_or_metadata(captured: Captured):
 def test_what_moves_is_in_the_loss(captured: Captured, tmp_path: Path):
     """Training differs if only the pixels that the motion masks show have another color."""
     painted = tmp_path / "painted"
-    write_dataset(captured.images, captured.frames, captured.poses, captured.masks, painted)
+    write_dataset(captured.images, captured.frames, captured.found.poses, captured.found.masks, painted)
     for frame in captured.frames.frames:
         image = read_color(painted / "images" / frame.name)
         image[read_gray(painted / MOTION_MASKS / frame.name) > 0] = (255, 0, 255)
@@ -192,7 +171,7 @@ def test_an_interrupted_search_ends_its_process(captured: Captured, tmp_path: Pa
 
     with pytest.raises(KeyboardInterrupt):
         find_poses(captured.images, captured.frames, tmp_path, threads=1, progress=interrupt)
-    assert stages == [("features", 0, FRAMES)]
+    assert stages == [("features", 0, COUNT)]
     assert not (tmp_path / "geometry.npz").exists()
 
 
