@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -15,10 +14,8 @@ from msdgs_serve.scene.camera import OPENGL_TO_OPENCV
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.capture.frame_set import FrameSet
 from msdgs_train.capture.frames import extract_frames
-from msdgs_train.capture.masked_poses import Keep, find_masked_poses, step_names
 from msdgs_train.capture.offsets import find_offsets
 from msdgs_train.capture.poses import Poses, find_poses
-from msdgs_train.capture.progress import Progress
 from tests.support.clips import Clip, fixed_camera_clips, moving_camera_clip
 
 OFFSETS = (0.0, 0.08, 0.16, 0.24, 0.32, 0.4)  # seconds
@@ -51,9 +48,9 @@ def main(
 
     python -m benchmarks.capture.capture_truth --video hand.mp4 --poses precomputed.json
 
-    A camera moves around moving toys in front of a poster that swings: poses from all matches, from those on what
-    stands still, and also without features where masks say that something moves. Six cameras stand around the toys.
-    Centers' errors are percentages of the diagonal of the box around the true centers.
+    A camera moves around moving toys in front of a poster that swings, and poses are found of all matches and of those
+    on what stands still; six cameras stand around the toys. Centers' errors are percentages of the diagonal of the box
+    around the true centers.
 
     Args:
         parts: Clips: a moving camera, six fixed ones.
@@ -74,7 +71,7 @@ def main(
         if "moving" in parts:
             clip = moving_camera_clip(folder / "clip.mp4", width=width, frames=frames, arc=arc, seed=seed)
             share = f"{clip.moving.mean():.0%} moves"
-            for name, found, taken in _three_ways(clip.file, folder / "clip", seed, threads):
+            for name, found, taken in _both_ways(clip.file, folder / "clip", seed, threads):
                 made.add_row(f"arc of {arc:g}°, {share}, {name}", *_row(found, taken, clip.camera_to_world, clip.times))
         if "fixed" in parts:
             rig = fixed_camera_clips(folder, width=width, frames=rig_frames, offsets=OFFSETS, seed=seed)
@@ -82,33 +79,22 @@ def main(
             made.add_row(f"six fixed cameras, offsets within {off:.2f} frames", *cells)
         if video is not None and poses is not None:
             given = read_poses(poses)
-            for name, found, taken in _three_ways(video, folder / "video", seed, threads):
+            for name, found, taken in _both_ways(video, folder / "video", seed, threads):
                 made.add_row(f"{video.name}, {name}", *_row(found, taken, given, None))
     report_console().print(machine(), made)
     return 0
 
 
-def _three_ways(video: Path, folder: Path, seed: int, threads: int) -> list[tuple[str, Poses, FrameSet]]:
+def _both_ways(video: Path, folder: Path, seed: int, threads: int) -> list[tuple[str, Poses, FrameSet]]:
     images = folder / "images"
     taken = extract_frames([video], images)
-    everything = find_poses(
-        images, taken, folder / "all", seed=seed, threads=threads, all_matches=True, progress=_progress
-    )
-    masked = find_masked_poses(images, taken, _run_in(folder), seed=seed, threads=threads)
-    static = Poses.load(folder / step_names()[0], taken)
-    found = {"all matches": everything, "what stands still": static, f"masks, {masked.passes} passes": masked.poses}
-    return [(name, poses, taken) for name, poses in found.items()]
-
-
-def _run_in(folder: Path) -> Keep:
-    """Runs each step, in a folder of its name."""
-
-    def keep(name: str, run: Callable[[Path, Progress], None]) -> Path:
-        (folder / name).mkdir(parents=True)
-        run(folder / name, _progress)
-        return folder / name
-
-    return keep
+    found = []
+    for name, all_matches in (("all matches", True), ("what stands still", False)):
+        poses = find_poses(
+            images, taken, folder / name, seed=seed, threads=threads, all_matches=all_matches, progress=_progress
+        )
+        found.append((name, poses, taken))
+    return found
 
 
 def rig_row(rig: list[Clip], folder: Path, seed: int, threads: int) -> tuple[float, list[str]]:

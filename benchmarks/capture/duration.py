@@ -58,8 +58,7 @@ def main(
         return main(frames=14, size=160, long_side=320, threads=1)
     with scratch_folder() as folder:
         if video is None:
-            arc = moving_camera_clip(folder / "clip.mp4", width=size, frames=frames, rate=RATE, arc=ARC)
-            video, arc = arc.file, None  # its masks take memory
+            video = moving_camera_clip(folder / "clip.mp4", width=size, frames=frames, rate=RATE, arc=ARC).file
             if long_side is not None:
                 video = enlarged(video, folder / "large.mp4", long_side)
         costs, told = captured(video, folder / "data", CaptureOptions(frames, size), threads)

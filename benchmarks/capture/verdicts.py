@@ -21,7 +21,8 @@ from benchmarks.capture.capture_truth import errors_of
 from benchmarks.measuring import machine
 from msdgs_serve.writing import scratch_folder
 from msdgs_train.capture.job import CaptureJob, CaptureOptions
-from msdgs_train.capture.masked_poses import step_names
+from msdgs_train.capture.masked_poses import POSES
+from msdgs_train.capture.recordings import WORK
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 from tests.support.camera_moves import arc, pan, tripod
 from tests.support.clips import clip_of_poses
@@ -84,8 +85,8 @@ def captured(case: Case, width: int, threads: int) -> dict[str, object]:
 
 def _errors(data: Path, truth: np.ndarray) -> dict[str, object]:
     """The largest errors of the last poses that were found."""
-    found = [file for name in step_names() if (file := data / "capture" / name / GEOMETRY).is_file()]
-    model = Summary.load(found[-1]) if found else None
+    found = data / WORK / POSES / GEOMETRY
+    model = Summary.load(found) if found.is_file() else None
     if model is None or len(model.names) < 3:
         return {"rotation": "", "centers": ""}
     rows = [int(str(name).split(".")[0]) for name in model.names]

@@ -14,24 +14,29 @@ STILL = 0.002
 """Part of the width by which a corner of the background may move: one pixel of 500."""
 ENOUGH = 0.3
 """Part of the corners that are at rest when the camera is; the others are on what moves."""
-COMPARED = 8
-"""Frames that the first one is compared with."""
+COMPARED = 16
+"""Frames that are compared with their median."""
+SHOWN = 0.6
+"""Part of the compared frames, at least, that show the background."""
 PASSING = 0.15
-"""Part of the compared frames in which something may hide the background."""
+"""Part of the compared frames, at most, that don't at the start or at the end: between others, something passes, but a
+camera that moves doesn't come back to the same place."""
 BACKGROUND = 40
 """Frames whose median is the background."""
 
 
 def is_fixed(files: Sequence[Path]) -> bool:
-    """Whether enough corners of the first image stay where they are in the others, which are in the order of time."""
+    """Whether enough corners stay where they are in most of the images, which are in the order of time."""
     if len(files) < 2:
         return False
-    first = read_gray(files[0])
-    corners = cv2.goodFeaturesToTrack(first, CORNERS, CORNER_QUALITY, CORNER_DISTANCE)
+    compared = [read_gray(file) for file in spread(files, COMPARED)]
+    usual = np.median(compared, axis=0).astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(usual, CORNERS, CORNER_QUALITY, CORNER_DISTANCE)
     if corners is None:
         return False
-    still = [_still_part(first, read_gray(file), corners) for file in spread(files[1:], COMPARED)]
-    return float(np.quantile(still, PASSING)) > ENOUGH
+    shown = np.array([_still_part(usual, each, corners) > ENOUGH for each in compared])
+    ends = int(PASSING * len(shown)) + 1
+    return bool(shown.mean() >= SHOWN and shown[:ends].any() and shown[-ends:].any())
 
 
 def background(files: Sequence[Path]) -> np.ndarray:
@@ -40,7 +45,7 @@ def background(files: Sequence[Path]) -> np.ndarray:
     return np.median(images, axis=0).astype(np.uint8)
 
 
-def _still_part(first: np.ndarray, other: np.ndarray, corners: np.ndarray) -> float:
-    moved, found, _ = cv2.calcOpticalFlowPyrLK(first, other, corners, corners.copy())
+def _still_part(usual: np.ndarray, other: np.ndarray, corners: np.ndarray) -> float:
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(usual, other, corners, corners.copy())
     lengths = np.linalg.norm((moved - corners).reshape(-1, 2), axis=1)
-    return float(np.mean((lengths < STILL * first.shape[1]) & (found.ravel() == 1)))
+    return float(np.mean((lengths < STILL * usual.shape[1]) & (found.ravel() == 1)))

@@ -17,6 +17,8 @@ from msdgs_train.capture.video_source import VideoSource
 
 DIGITS = 5
 """Of a frame's number in its name, at least."""
+MIN_SIZE = 64
+"""Pixels of the longer side; smaller pictures have next to no features."""
 
 
 def extract_frames(
@@ -38,11 +40,21 @@ def extract_frames(
     Each video is decoded once, with two of its frames in memory. Raises `CaptureFailed`, `InvalidInput` and
     `WriteFailed`.
     """
-    for name, value in (("frames", frames), ("size", size)):
-        if value < 1:
-            raise InvalidInput(name, "1 or more", value)
-    offsets = starts(inputs, offsets)
+    check_amounts(frames, size)
     sources = [open_source(file, size) for file in inputs]
+    return take_frames(sources, folder, frames=frames, offsets=offsets, progress=progress)
+
+
+def take_frames(
+    sources: Sequence[Source],
+    folder: Path,
+    *,
+    frames: int,
+    offsets: Sequence[float] | None,
+    progress: Callable[[int, int], None] | None,
+) -> FrameSet:
+    """`extract_frames` of sources that are open."""
+    offsets = starts(sources, offsets)
     _require_common_moments(sources, offsets)
     step = max(source.duration + source.period for source in sources) / frames
     ticker = _Ticker(sum(source.count for source in sources), progress)
@@ -58,6 +70,13 @@ def extract_frames(
     return _frame_set(sources, offsets, selections, folder)
 
 
+def check_amounts(frames: int, size: int) -> None:
+    """Raise `InvalidInput` for numbers of frames, and of pixels of the longer side, that no capture can have."""
+    for name, value, least in (("frames", frames, 1), ("size", size, MIN_SIZE)):
+        if not least <= value < 2**31:
+            raise InvalidInput(name, f"{least} or more, below 2³¹", value)
+
+
 def open_source(file: Path, size: int) -> Source:
     """The pictures of a video or of a folder of images. Raises `CaptureFailed`."""
     if not file.exists():
@@ -70,7 +89,7 @@ def camera_name(index: int, count: int) -> str:
     return "" if count == 1 else f"cam{index + 1:0{max(2, len(str(count)))}}"
 
 
-def starts(inputs: Sequence[Path], offsets: Sequence[float] | None) -> list[float]:
+def starts(inputs: Sequence[Path | Source], offsets: Sequence[float] | None) -> list[float]:
     """Seconds on the clock of the first camera at which each starts, 0 if `offsets` is None. Raises `InvalidInput`."""
     if not inputs:
         raise InvalidInput("inputs", "one video or more", "none")

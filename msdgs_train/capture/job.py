@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.capture.dataset import write_dataset
 from msdgs_train.capture.frame_set import FrameSet
-from msdgs_train.capture.frames import extract_frames, starts
-from msdgs_train.capture.masked_poses import MaskedPoses, find_masked_poses, step_names
+from msdgs_train.capture.frames import check_amounts, open_source, starts, take_frames
+from msdgs_train.capture.masked_poses import MASKS, POSES, MaskedPoses, find_masked_poses
 from msdgs_train.capture.measures import measure_frames, measure_poses
 from msdgs_train.capture.offsets import find_offsets
 from msdgs_train.capture.progress import Progress
@@ -21,15 +21,14 @@ from msdgs_train.capture.verdict import Verdict, judge, judge_frames
 
 STEPS: dict[str, tuple[str, ...]] = {
     "frames": (),
-    **dict.fromkeys(step_names(), ()),
+    POSES: (),
+    MASKS: (),
     "dataset": ("images", "motion_masks", "times.json", "sparse"),
     "report": ("capture.json", "capture.html"),
 }
 """The steps, and what they put into the dataset's folder. A dataset is one once it has `sparse`."""
 
 FRAMES, IMAGES = "frames.json", "images"
-MIN_SIZE = 64
-"""Pixels; smaller pictures have next to no features."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +44,9 @@ class CaptureOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, value, least in (("frames", self.frames, 1), ("size", self.size, MIN_SIZE), ("seed", self.seed, 0)):
-            if not least <= value < 2**31:
-                raise InvalidInput(name, f"{least} or more, below 2³¹", value)
+        check_amounts(self.frames, self.size)
+        if not 0 <= self.seed < 2**31:
+            raise InvalidInput("seed", "0 or more, below 2³¹", self.seed)
 
 
 class Outcome(NamedTuple):
@@ -76,7 +75,8 @@ class CaptureJob:
             raise InvalidInput("threads", "1 or more", threads)
         starts(recordings, options.offsets)
         self.recordings, self.data, self.options, self.threads = recordings, data, options, threads
-        self.required_bytes = required_bytes(recordings, options.frames, options.size)
+        self._sources = [open_source(recording, options.size) for recording in recordings]
+        self.required_bytes = required_bytes(self._sources, options.frames)
         digest = digest_of(recordings)
         claim(data, digest)
         self.steps = Steps(STEPS, data / WORK, digest, force=force_step, watch=watch)
@@ -117,11 +117,10 @@ class CaptureJob:
         if offsets is None and len(self.recordings) > 1:
             found = find_offsets(self.recordings)
             offsets, notes = found.seconds, [found.note]
-        frames = extract_frames(
-            self.recordings,
+        frames = take_frames(
+            self._sources,
             folder / IMAGES,
             frames=self.options.frames,
-            size=self.options.size,
             offsets=offsets,
             progress=lambda done, total: progress("reading", done, total),
         )

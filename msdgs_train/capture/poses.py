@@ -11,7 +11,7 @@ from pathlib import Path
 
 from msdgs_train.capture.fixed_cameras import background, is_fixed
 from msdgs_train.capture.frame_set import FrameSet
-from msdgs_train.capture.image_files import read_gray, write_image
+from msdgs_train.capture.image_files import write_image
 from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, run_sfm
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
@@ -19,7 +19,6 @@ from msdgs_train.capture.views import View, matched_pairs
 
 SPARSE = "sparse"
 BACKGROUNDS = "backgrounds"
-FEATURE_MASKS = "feature_masks"
 ALL_PROCESSORS = -1
 
 
@@ -51,7 +50,6 @@ def find_poses(
     frames: FrameSet,
     workspace: Path,
     *,
-    masks: Path | None = None,
     seed: int = 0,
     threads: int | None = None,
     all_matches: bool = False,
@@ -59,10 +57,9 @@ def find_poses(
 ) -> Poses:
     """Find the poses of frames in the folder `images`; `workspace` takes the database, the model and `geometry.npz`.
 
-    `masks` holds an image of each frame's name, white where no features are taken; backgrounds need none. One thread
-    gives the same poses each time. With `all_matches` those on what moves count as well, for comparison. `progress` is
-    called with the stage, what is done and the total. Raises `CaptureFailed` if COLMAP ends with an error; without any
-    model the result has no registered frames.
+    One thread gives the same poses each time. With `all_matches` those on what moves count as well, for comparison.
+    `progress` is called with the stage, what is done and the total. Raises `CaptureFailed` if COLMAP ends with an
+    error; without any model the result has no registered frames.
     """
     workspace = workspace.absolute()
     workspace.mkdir(parents=True, exist_ok=True)
@@ -78,9 +75,8 @@ def find_poses(
         for camera, own in enumerate(names)
         if own
     )
-    feature_masks = None if masks is None else _feature_masks(masks, workspace / FEATURE_MASKS, views)
     pairs = tuple(matched_pairs(views))
-    job = PosesJob(str(workspace), cameras, pairs, feature_masks, seed, threads or ALL_PROCESSORS, all_matches)
+    job = PosesJob(str(workspace), cameras, pairs, seed, threads or ALL_PROCESSORS, all_matches)
     run_sfm(job, images, progress)
     return Poses.load(workspace, frames)
 
@@ -94,11 +90,3 @@ def _background(images: Path, names: tuple[str, ...], workspace: Path, camera: i
         return False
     write_image(file, background(files))
     return True
-
-
-def _feature_masks(masks: Path, out: Path, views: list[View]) -> str:
-    """Write the masks as COLMAP takes them, black where no features are taken, and return their folder."""
-    for view in views:
-        if not view.is_background:
-            write_image(out / f"{view.name}.png", 255 - read_gray(masks / view.name))
-    return str(out)

@@ -13,7 +13,7 @@ from msdgs_serve import __version__
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import write_text
 from msdgs_train.capture.errors import CaptureFailed
-from msdgs_train.capture.frames import open_source
+from msdgs_train.capture.pictures import Source
 
 WORK = "capture"
 """Folder of the steps' results in the dataset's folder."""
@@ -21,8 +21,8 @@ CLAIM = "recordings.json"
 """File in `WORK` that tells whose capture the folder is."""
 BYTES_PER_PIXEL = 4.0
 """Frames and images of the dataset as PNG, of 1.5 to 2 bytes a pixel each, and masks."""
-BYTES_PER_FRAME = 2_000_000
-"""COLMAP's database: descriptors of 8,192 features, and matches."""
+BYTES_PER_FRAME = 4_000_000
+"""Two of COLMAP's databases: descriptors of 8,192 features, and matches."""
 
 
 def digest_of(recordings: Sequence[Path]) -> str:
@@ -79,12 +79,8 @@ def held(data: Path) -> Iterator[None]:
         os.close(folder)
 
 
-def required_bytes(recordings: Sequence[Path], frames: int, size: int) -> int:
-    """Bytes of disk that a capture takes at most while it runs, about; `size` is the longer side in pixels.
-
-    Raises `CaptureFailed` for a recording that can't be read.
-    """
-    sources = [open_source(recording, size) for recording in recordings]
+def required_bytes(sources: Sequence[Source], frames: int) -> int:
+    """Bytes of disk that a capture takes at most while it runs, about."""
     of_frames = [each.width * each.height * BYTES_PER_PIXEL + BYTES_PER_FRAME for each in sources]
     return round(sum(min(frames, each.count) * of_frame for each, of_frame in zip(sources, of_frames, strict=True)))
 

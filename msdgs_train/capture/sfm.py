@@ -98,8 +98,6 @@ def extract(job: PosesJob, database: Path) -> None:
         reader = pycolmap.ImageReaderOptions(camera_model=CAMERA_MODEL)
         if camera.frames is not None:
             options.sift.peak_threshold = BACKGROUND_PEAK
-        if job.masks is not None and camera.frames is None:
-            reader.mask_path = Path(job.masks)
         for names in _batches(camera.names, BATCH):
             report("features", done, total)
             mode = pycolmap.CameraMode.SINGLE

@@ -38,8 +38,6 @@ class PosesJob:
     workspace: str
     cameras: tuple[CameraViews, ...]
     pairs: tuple[tuple[str, str], ...]
-    masks: str | None
-    """Folder of `NAME.png` for each image `NAME`, black where there are to be no features."""
     seed: int
     threads: int
     """-1: all processors."""

@@ -28,8 +28,8 @@ class Capture:
     camera each. DATA is the folder to create: a COLMAP dataset with times.json, and capture.html, which shows what was
     found and says whether it suffices for a scene, or what to record differently. It shows pictures of the recording.
 
-    Steps are frames, poses, masks of what moves, then poses and masks without it as long as that helps, dataset and
-    report. Ctrl-C loses the one under way; the same command continues, and repeats what other options change.
+    Steps are frames, poses, masks of what moves, dataset and report. Ctrl-C loses the one under way; the same command
+    continues, and repeats what other options change.
 
     One moving camera:  msdgs-train capture clip.mp4 data/clip
 

@@ -170,11 +170,11 @@ def test_a_full_disk_is_told_before_it_starts(
 
     clip = write_clip(tmp_path / "clip.mp4", pictures(50))
     monkeypatch.setattr(recordings_module.shutil, "disk_usage", lambda path: Usage)
-    monkeypatch.setattr(job_module, "extract_frames", lambda *args, **options: pytest.fail("it started"))
+    monkeypatch.setattr(job_module, "take_frames", lambda *args, **options: pytest.fail("it started"))
     assert main(["capture", str(clip), str(tmp_path / "data"), "--frames", "40"]) == EXIT_INVALID
     captured = capsys.readouterr()
-    assert "takes up to 0.1 GB" in captured.out
-    assert "needs up to 0.1 GB on a disk that has 0.0 GB free" in captured.err
+    assert "takes up to 0.2 GB" in captured.out
+    assert "needs up to 0.2 GB on a disk that has 0.0 GB free" in captured.err
 
 
 @pytest.mark.parametrize(

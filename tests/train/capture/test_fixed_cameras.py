@@ -1,5 +1,6 @@
 """Which cameras stand still."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,9 +10,6 @@ import pytest
 from msdgs_train.capture.fixed_cameras import is_fixed
 from msdgs_train.capture.image_files import write_image
 from tests.train.capture.clips import picture
-
-PASSED = 4
-"""The frame that somebody hides who passes."""
 
 
 def files_of(folder: Path, images: Sequence[np.ndarray]) -> list[Path]:
@@ -30,7 +28,13 @@ def test_a_camera_that_moves_at_times_is_not_fixed(tmp_path: Path, shifts: Seque
     assert not is_fixed(files_of(tmp_path, [picture(shift) for shift in shifts]))
 
 
-def test_a_camera_is_fixed_though_somebody_passes_in_front_of_it(tmp_path: Path):
+@pytest.mark.parametrize("hidden", [[4], [3, 4, 5], [0], [8], [0, 4, 5]], ids=str)
+def test_a_camera_is_fixed_though_somebody_hides_what_it_sees(tmp_path: Path, hidden: list[int]):
     images = [picture(0)] * 9
-    images[PASSED] = np.full_like(images[0], 40)
+    for index in hidden:
+        images[index] = picture(index, seed=7)
     assert is_fixed(files_of(tmp_path, images))
+
+
+def test_a_camera_that_sways_is_not_fixed(tmp_path: Path):
+    assert not is_fixed(files_of(tmp_path, [picture(2 * math.sin(index)) for index in range(20)]))

@@ -120,7 +120,7 @@ def test_a_cut_is_found_and_a_pan_is_none(tmp_path: Path):
     assert extract_frames([pan], tmp_path / "out2").cuts == ()
 
 
-@pytest.mark.parametrize(("size", "wanted"), [(48, (48, 32)), (1024, (96, 64)), (50, (50, 33))])
+@pytest.mark.parametrize(("size", "wanted"), [(72, (72, 48)), (1024, (96, 64)), (64, (64, 43))])
 def test_the_long_side_is_reduced_and_never_enlarged(tmp_path: Path, size: int, wanted: tuple[int, int]):
     frames = extract_frames([write_clip(tmp_path / "clip.mp4", pictures(2))], tmp_path / "out", size=size)
     assert (frames.cameras[0].width, frames.cameras[0].height) == wanted
@@ -172,10 +172,12 @@ def test_progress_reaches_the_end_and_what_is_stored_is_read_again(tmp_path: Pat
     assert FrameSet.load(tmp_path / "frames.json") == frames
 
 
-def test_frames_and_size_are_positive(tmp_path: Path):
+def test_too_few_frames_and_pixels_are_refused(tmp_path: Path):
     clip = write_clip(tmp_path / "clip.mp4", pictures(2))
-    with pytest.raises(InvalidInput, match="`frames` must be 1 or more, got 0"):
+    with pytest.raises(InvalidInput, match=r"`frames` must be 1 or more, .* got 0"):
         extract_frames([clip], tmp_path / "out", frames=0)
+    with pytest.raises(InvalidInput, match=r"`size` must be 64 or more, .* got 63"):
+        extract_frames([clip], tmp_path / "out", size=63)
     with pytest.raises(CaptureFailed, match=r"none\.mp4: does not exist"):
         extract_frames([tmp_path / "none.mp4"], tmp_path / "out")
 

@@ -28,7 +28,7 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     poses = made_poses(made_model(frames))
     moving = {frame.name: 0.5 for frame in frames.frames}
     measures = measure_poses(measure_frames(frames), frames, poses, moving)
-    found = MaskedPoses(poses, folder / "masks", moving, 1)
+    found = MaskedPoses(poses, folder / "masks", moving)
     report = Report(frames, measures, judge(measures), folder / "images", found)
     pictures: list[int] = []
     write_report(report, folder, lambda stage, done, total: pictures.append(done))
@@ -104,7 +104,7 @@ def test_poses_without_points_are_reported(tmp_path: Path):
     write_images(frames, tmp_path / "images", tmp_path / "masks")
     poses = made_poses(made_model(frames, points=0))
     measures = measure_poses(measure_frames(frames), frames, poses, {})
-    found = MaskedPoses(poses, tmp_path / "masks", {}, 0)
+    found = MaskedPoses(poses, tmp_path / "masks", {})
     write_report(Report(frames, measures, judge(measures), tmp_path / "images", found), tmp_path, lambda *_: None)
     assert judge(measures).level == "no scene"
     assert "<svg" not in (tmp_path / "capture.html").read_text(encoding="utf-8")
