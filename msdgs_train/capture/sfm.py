@@ -77,8 +77,11 @@ def find(job: PosesJob) -> None:
     pycolmap.set_random_seed(job.seed)
     extract(job, database)
     match(job, database)
-    models, method = mapped(job, database, workspace)
-    largest = refined(models[0], job, database) if models else pycolmap.Reconstruction()
+    static = workspace / "static.db"
+    models, method = mapped(job, database, static)
+    largest = models[0] if models else pycolmap.Reconstruction()
+    if models and not _only_fixed(job):
+        largest = refined(largest, job, database)
     _color(largest, job.cameras)
     _spread_to_frames(largest, job.cameras)
     sparse = workspace / "sparse"
@@ -86,8 +89,10 @@ def find(job: PosesJob) -> None:
     sparse.mkdir()
     largest.write(sparse)
     sizes = [model.num_reg_images() for model in models]
-    summary(largest, method, sizes[1:], _beyond_rotation(database)).save(workspace / GEOMETRY)
-    database.unlink()
+    turned = _beyond_rotation(static if static.exists() else database)
+    summary(largest, method, sizes[1:], turned).save(workspace / GEOMETRY)
+    for each in (database, static):
+        each.unlink(missing_ok=True)
 
 
 def extract(job: PosesJob, database: Path) -> None:
@@ -111,7 +116,7 @@ def extract(job: PosesJob, database: Path) -> None:
 def match(job: PosesJob, database: Path) -> None:
     """Match the pairs and write their two-view geometries."""
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
-    options.guided_matching = all(camera.frames is not None for camera in job.cameras)
+    options.guided_matching = _only_fixed(job)
     geometry = _geometry_options(job, database)
     chosen = Path(job.workspace) / "pairs.txt"
     done = 0
@@ -125,23 +130,20 @@ def match(job: PosesJob, database: Path) -> None:
     report("matching", done, done)
 
 
-def mapped(job: PosesJob, database: Path, workspace: Path) -> tuple[list[pycolmap.Reconstruction], str]:
+def mapped(job: PosesJob, database: Path, static: Path) -> tuple[list[pycolmap.Reconstruction], str]:
     """The models, the largest first, and the mapper that made them.
 
-    Of moving cameras, the matches are those on what stands still, and if these don't suffice, all. The mapper is the
-    incremental one, or the global one if that makes a larger model.
+    Of moving cameras, the matches are those on what stands still, of a database that is written to `static`, and if
+    these don't suffice, all. The mapper is the incremental one, or the global one if that makes a larger model.
     """
-    total = sum(len(camera.names) for camera in job.cameras)
-    only_fixed = all(camera.frames is not None for camera in job.cameras)
+    total, scratch = sum(len(camera.names) for camera in job.cameras), database.parent / "models"
     models, method = [], ""
-    if not (only_fixed or job.all_matches):
+    if not (_only_fixed(job) or job.all_matches):
         report("what stands still", 0, total)
-        static = workspace / "static.db"
         write_static(database, static, job.cameras, _geometry_options(job, database))
-        models, method = _mapped_by(job, static, workspace / "models", total)
-        static.unlink()
+        models, method = _mapped_by(job, static, scratch, total)
     if not models or _size(models[0])[0] < ENOUGH * total:
-        others, by = _mapped_by(job, database, workspace / "models", total, try_global=only_fixed)
+        others, by = _mapped_by(job, database, scratch, total, try_global=_only_fixed(job))
         if others and (not models or _size(others[0]) > _size(models[0])):
             models, method = others, by
     report("mapping", total, total)
@@ -164,7 +166,10 @@ def _mapped_by(
 
 
 def refined(model: pycolmap.Reconstruction, job: PosesJob, database: Path) -> pycolmap.Reconstruction:
-    """The model with points of all matches that agree with its poses, and poses, lens and points adjusted to them."""
+    """The model with points of all matches that agree with its poses, and poses, lens and points adjusted to them.
+
+    Not for fixed cameras only: each has one view, and its own lens is free to follow a few points more.
+    """
     tolerance, scratch = _tolerance(database), database.parent / "points"
     options = _incremental_options(job, tolerance)
     adjustment = pycolmap.BundleAdjustmentOptions(print_summary=False)
@@ -327,6 +332,10 @@ def _beyond_rotation(database: Path) -> float:
             ]
             pairs.append(Pair(*places))
     return long_side * beyond_rotation(pairs)
+
+
+def _only_fixed(job: PosesJob) -> bool:
+    return all(camera.frames is not None for camera in job.cameras)
 
 
 def _geometry_options(job: PosesJob, database: Path) -> pycolmap.TwoViewGeometryOptions:

@@ -12,6 +12,7 @@ from msdgs_serve.scene import InvalidInput
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.times_from import times_from
 from msdgs_train.datasets import load_scene
+from msdgs_train.datasets.common.readers import DatasetInvalid
 from tests.train.capture.clips import picture, write_clip
 from tests.train.datasets.layouts import nerfstudio_json
 from tests.train.datasets.lens import Lens
@@ -100,6 +101,14 @@ def test_one_foreign_image_and_another_order_are_refused(tmp_path: Path, clip: P
     write_dataset(tmp_path / "back", [view(index) for index in TAKEN[::-1]])
     with pytest.raises(CaptureFailed, match="the images are in another order"):
         times_from(clip, tmp_path / "back")
+
+
+def test_a_missing_image_is_named(tmp_path: Path, clip: Path):
+    write_dataset(tmp_path, [view(index) for index in TAKEN])
+    (tmp_path / "images" / "frame_3.jpg").unlink()
+    with pytest.raises(DatasetInvalid, match=r"names images/frame_3\.jpg, but there is no such file"):
+        times_from(clip, tmp_path)
+    assert not (tmp_path / "times.json").exists()
 
 
 def test_a_folder_that_needs_no_times_or_is_no_dataset_is_refused(tmp_path: Path, clip: Path):
