@@ -19,6 +19,7 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.hash4d import Hash4DConfig
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.layers.spline import SplineConfig
@@ -55,7 +56,21 @@ SCENE = SceneInfo(
 MLP = MLPConfig(width=32, depth=3, time_width=16, time_features=8)
 PLANE = PlaneConfig()
 SPLINE = SplineConfig(num_knots=3)
-SMALL_LAYERS: dict[str, LayerConfig] = {layer.kind: layer for layer in (MLP, PLANE, SPLINE)}
+HASH4D = Hash4DConfig(
+    levels=3,
+    coarsest=(4, 4, 3),
+    finest=(7, 7, 5),
+    log2_rows=7,
+    canonical_levels=3,
+    canonical_coarsest=(4, 4, 4),
+    canonical_finest=(17, 17, 17),
+    canonical_log2_rows=8,
+    width=16,
+    depth=1,
+    reach=1.2,
+)
+"""Of both kinds of grids, the finest level or more are hashed."""
+SMALL_LAYERS: dict[str, LayerConfig] = {layer.kind: layer for layer in (MLP, PLANE, SPLINE, HASH4D)}
 NODES = NodesConfig(num_nodes=4)
 
 

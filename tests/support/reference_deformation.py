@@ -1,5 +1,6 @@
 """A slow, obvious deformation in NumPy and float64: layers, chains, and linear blend skinning."""
 
+import itertools
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -10,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.base import DeformationLayer
+from msdgs_train.layers.hash4d import Hash4DLayer
+from msdgs_train.layers.hash_grid import HashGrid
 from msdgs_train.layers.mlp import MLPLayer
 from msdgs_train.layers.plane import PlaneGrid, PlaneLayer
 from msdgs_train.layers.spline import SplineLayer
@@ -97,14 +100,58 @@ def plain_curves(layer: SplineLayer, t: float) -> np.ndarray:
     return BSpline(knots, curves, 3)(np.clip(t, first, first + length))
 
 
+def plain_hash_features(grid: HashGrid, places: np.ndarray) -> np.ndarray:
+    """[N, L · C] features of places in the unit cube, [N, 3], node by node; zeros outside."""
+    levels, table = grid.levels, array(grid.table)
+    features = np.zeros((len(places), len(levels.nodes), table.shape[1]))
+    for n, place in enumerate(places):
+        if not all(0 <= axis <= 1 for axis in place):
+            continue
+        for level, (scale, nodes) in enumerate(zip(levels.scales.astype(np.float64), levels.nodes, strict=True)):
+            rows = int(levels.starts[level + 1] - levels.starts[level])
+            low = np.minimum(np.floor(place * scale), nodes - 2)
+            for corner in itertools.product((0, 1), repeat=3):
+                x, y, z = (int(index) for index in low + corner)
+                row = x + int(nodes[0]) * (y + int(nodes[1]) * z)
+                if np.prod(nodes) > rows:
+                    row = (x ^ (y * 2654435761 % 2**32) ^ (z * 805459861 % 2**32)) % rows
+                distances = np.abs(place * scale - (x, y, z))
+                weight = np.prod(1 - distances**2 * (3 - 2 * distances))  # symmetric about the middle of a cell
+                features[n, level] += weight * table[levels.starts[level] + row]
+    return features.reshape(len(places), -1)
+
+
+def plain_hash4d(layer: Hash4DLayer, means: np.ndarray, t: float) -> np.ndarray:
+    """The columns of all heads, after a turn about the origin as part of the deltas of means."""
+    half = array(layer.half_sizes)
+    space = (means / half + 1) / 2
+    time = np.full(len(means), 0.05 + 0.9 * (t - float(layer.first_time)) / float(layer.duration))
+    read = [
+        plain_hash_features(grid, np.stack([space[:, a], space[:, b], time], axis=1))
+        for grid, (a, b) in zip(layer.temporal, [(0, 1), (1, 2), (0, 2)], strict=True)
+        if isinstance(grid, HashGrid)
+    ]
+    hidden = np.maximum(linear(layer.from_temporal, np.concatenate(read, axis=1)), 0)
+    factors = 1 / (1 + np.exp(-linear(layer.from_canonical, plain_hash_features(layer.canonical, space))))
+    hidden = hidden * (2 * factors - 1)
+    for module in layer.hidden:
+        hidden = np.maximum(linear(module, hidden), 0)
+    columns = linear(layer.heads, hidden)
+    turned = rotation(columns[:, :4] + [1, 0, 0, 0]).apply(means) if len(means) else means
+    return np.concatenate([turned + columns[:, 4:7] - means, columns[:, 7:]], axis=1)
+
+
 def plain_step(layer: DeformationLayer, means: np.ndarray, t: float) -> PlainDeltas:
     """One layer, of a kind of this package, at points [N, 3]."""
     if isinstance(layer, SplineLayer):
         transls, rots, stretches = np.split(plain_curves(layer, t), [3, 7], axis=1)
         return PlainDeltas(transls, stretches, rots - [1, 0, 0, 0])
-    assert isinstance(layer, MLPLayer | PlaneLayer)
-    is_mlp = isinstance(layer, MLPLayer)
-    columns = linear(layer.heads, plain_hidden(layer, means, t)) if is_mlp else plain_plane(layer, means, t)
+    if isinstance(layer, Hash4DLayer):
+        columns = plain_hash4d(layer, means, t)
+    else:
+        assert isinstance(layer, MLPLayer | PlaneLayer)
+        is_mlp = isinstance(layer, MLPLayer)
+        columns = linear(layer.heads, plain_hidden(layer, means, t)) if is_mlp else plain_plane(layer, means, t)
     weight = 1 / (1 + np.exp(-columns[:, 10:])) if layer.outputs.weight else 1.0
     return PlainDeltas(columns[:, :3], columns[:, 3:6], columns[:, 6:10], weight)
 

@@ -24,6 +24,7 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.hash4d import Hash4DConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.layers.plane import PlaneConfig
@@ -39,6 +40,9 @@ FEW = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90"]
 
 MLP = MLPConfig(width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_width=8, time_features=4)
 PLANE = PlaneConfig(features=4, resolution=6, time_resolution=5, width=8)
+TINY_GRIDS: dict[str, Any] = {"levels": 3, "log2_rows": 8, "canonical_levels": 3, "canonical_log2_rows": 8, "width": 8}
+"""Sizes of a hash layer."""
+HASH4D = Hash4DConfig(**TINY_GRIDS, depth=1)
 SMALL_MODEL = ModelConfig(sh_degree=1, layers=(MLP, MLP), embedding_dim=4)
 SPLINES = ModelConfig(
     sh_degree=1, support=NodesConfig(num_nodes=4), layers=(SplineConfig(num_knots=8),), embedding_dim=0
@@ -49,6 +53,7 @@ MODELS = {
     "mixed on nodes": dataclasses.replace(
         SMALL_MODEL, support=NodesConfig(num_nodes=6), layers=(SplineConfig(num_knots=8), PLANE, MLP)
     ),
+    "hash4d": dataclasses.replace(SMALL_MODEL, layers=(HASH4D,), scale_space="linear"),
     "mixed on gaussians": dataclasses.replace(SMALL_MODEL, layers=(PLANE, MLP)),
 }
 
@@ -95,6 +100,8 @@ def _narrow(layer: LayerConfig) -> LayerConfig:
         return dataclasses.replace(layer, width=16, time_width=8, time_features=4)
     if isinstance(layer, PlaneConfig):
         return dataclasses.replace(layer, features=4, resolution=6, time_resolution=5, width=8)
+    if isinstance(layer, Hash4DConfig):
+        return dataclasses.replace(layer, **TINY_GRIDS)
     return layer
 
 

@@ -82,6 +82,7 @@ RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "unseen removed": ({"prune_unseen_passes": 0.05, "window_full_fraction": 0.0, "scene_half_size": 2.0}, (11, 16)),
     "mlp on nodes": ({"model": MODELS["mlp on nodes"]}, (3, 13)),
     "mixed on nodes": ({"model": MODELS["mixed on nodes"], "batch_size": 2}, (8, 13)),
+    "hash4d": ({"model": MODELS["hash4d"], "batch_size": 2, "threads": 2}, (13,)),
     "mixed on gaussians": ({"model": MODELS["mixed on gaussians"]}, (13,)),
     "mcmc": ({"density_strategy": "mcmc"}, (11,)),
     "default": (

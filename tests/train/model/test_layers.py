@@ -8,9 +8,11 @@ import torch
 from msdgs_train.gaussians.modulation import Modulation
 from msdgs_train.layers.base import DeformationLayer, Heads
 from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.hash4d import Hash4DLayer
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer, frequency_matrix, positional_encoding
 from msdgs_train.layers.plane import PlaneLayer
 from msdgs_train.layers.spline import SplineConfig, SplineLayer
+from tests.support.models import HASH4D
 from tests.support.reference_deformation import plain_encoding, plain_hidden, plain_step
 from tests.support.tolerances import assert_close, tolerance
 
@@ -42,7 +44,8 @@ def test_the_modulation_has_the_papers_size_starts_at_one_and_stays_bounded():
 
 
 @pytest.mark.parametrize(
-    "layer", [MLPLayer(MLPConfig(depth=2)), PlaneLayer(), SplineLayer(SplineConfig(), 9, (0.0, 1.0))]
+    "layer",
+    [MLPLayer(MLPConfig(depth=2)), PlaneLayer(), SplineLayer(SplineConfig(), 9, (0.0, 1.0)), Hash4DLayer(HASH4D)],
 )
 def test_a_new_layer_moves_nothing_but_has_weights(layer: DeformationLayer):
     with torch.no_grad():
