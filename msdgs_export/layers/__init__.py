@@ -4,6 +4,7 @@ A kind from outside this package registers itself with `LAYERS[kind] = export`, 
 """
 
 from msdgs_export.layers.base import HEAD_COLUMNS, HEADS, LayerExport, LayerInputs, ModelNotExportable
+from msdgs_export.layers.hash4d import Hash4DExport
 from msdgs_export.layers.mlp import MLPExport
 from msdgs_export.layers.plane import PlaneExport
 from msdgs_export.layers.spline import SplineExport
@@ -11,7 +12,12 @@ from msdgs_train.layers.base import DeformationLayer
 
 __all__ = ["HEADS", "HEAD_COLUMNS", "LAYERS", "LayerExport", "LayerInputs", "ModelNotExportable", "export_of"]
 
-LAYERS: dict[str, LayerExport] = {"mlp": MLPExport(), "plane": PlaneExport(), "spline": SplineExport()}
+LAYERS: dict[str, LayerExport] = {
+    "mlp": MLPExport(),
+    "plane": PlaneExport(),
+    "spline": SplineExport(),
+    "hash4d": Hash4DExport(),
+}
 """By the attribute `kind` of a layer."""
 
 

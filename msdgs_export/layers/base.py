@@ -1,5 +1,7 @@
 """The interface of the export of a kind of deformation layer."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
@@ -25,6 +27,7 @@ class LayerInputs(NamedTuple):
     means: str  # [P, 3] points, Gaussians or control nodes, as moved by the layers before it
     time: str  # [1, 1]
     gate: str  # [1] fraction of the layer that the input `steps` applies, in [0, 1]
+    constants: Mapping[str, str] = MappingProxyType({})  # [P, …] by name: what `point_constants` gives the points
 
 
 class LayerExport(Protocol):
@@ -37,6 +40,11 @@ class LayerExport(Protocol):
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
         """Add the nodes of one layer. Returns the deltas of the heads `used`, side by side, times weight and gate."""
+        ...
+
+    def point_constants(self, layer: DeformationLayer, points: np.ndarray) -> dict[str, np.ndarray]:
+        """Rows [P, …] by name that the layer reads of canonical points, [P, 3], whatever the time; float32. Only the
+        first layer of a chain, whose points are canonical, may have any."""
         ...
 
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
@@ -59,6 +67,10 @@ class FieldLayerExport:
         heads = heads_of(inputs.layer)
         rows = output_rows(used, heads)
         return weighted(graph, inputs, self.outputs(graph, inputs, rows), len(rows), heads.weight)
+
+    def point_constants(self, layer: DeformationLayer, points: np.ndarray) -> dict[str, np.ndarray]:
+        """None: the field is evaluated in the graph."""
+        return {}
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Add the nodes of the field. Returns these output columns, [P, len(rows)]; the logit of the weight is last, if

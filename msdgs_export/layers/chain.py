@@ -1,11 +1,12 @@
 """A chain of layers as part of a graph (equations 7 to 9)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
 from msdgs_export.layers import export_of
-from msdgs_export.layers.base import HEADS, LayerInputs, heads_of
+from msdgs_export.layers.base import HEADS, LayerInputs, ModelNotExportable, heads_of
 from msdgs_export.layers.graph import GraphBuilder
 from msdgs_train.layers.base import DeformationLayer
 
@@ -19,6 +20,25 @@ def used_heads(layers: Sequence[DeformationLayer]) -> list[str]:
     return [head for head in heads_of(layers[0]).columns if any(head not in heads for heads in inert)] or ["means"]
 
 
+def point_constants(layers: Sequence[DeformationLayer], points: np.ndarray) -> dict[str, np.ndarray]:
+    """What layers read of canonical points, [P, 3], whatever the time: rows [P, …] by names of a graph.
+
+    Raises `ModelNotExportable` if another than the first layer does.
+    """
+    found: dict[str, np.ndarray] = {}
+    for k, layer in enumerate(layers, start=1):
+        own = export_of(layer).point_constants(layer, points)
+        if own and k > 1:
+            raise ModelNotExportable(f"layer {k} is of kind {layer.kind!r}, which can only be exported as the first")
+        found |= {f"layer{k}.{name}": values for name, values in own.items()}
+    return found
+
+
+def stored_constants(graph: GraphBuilder, layers: Sequence[DeformationLayer], points: np.ndarray) -> dict[str, str]:
+    """`point_constants` in a graph that poses all of these points."""
+    return {name: graph.constant(name, rows) for name, rows in point_constants(layers, points).items()}
+
+
 def summed_deltas(
     graph: GraphBuilder,
     layers: Sequence[DeformationLayer],
@@ -27,14 +47,17 @@ def summed_deltas(
     steps: str,
     used: list[str],
     num_nodes: int | None = None,
+    constants: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, str]:
-    """Deltas of points, [P, 3], by head; on control nodes scales have six columns."""
+    """Deltas of points, [P, 3], by head; on control nodes scales have six columns. `constants` are the graph's values
+    of `point_constants`."""
     widths = {name: columns.stop - columns.start for name, columns in heads_of(layers[0]).columns.items()}
     widths |= {} if num_nodes is None else {"scales": STRETCH_COLUMNS}
     total, moved, parts = "", points, dict[str, str]()
     for k, layer in enumerate(layers, start=1):
         name, export = f"layer{k}", export_of(layer)
-        step = export.deltas(graph, LayerInputs(name, layer, moved, time, _gate(graph, name, steps, k)), used)
+        own = {n.removeprefix(f"{name}."): value for n, value in constants.items() if n.startswith(f"{name}.")}
+        step = export.deltas(graph, LayerInputs(name, layer, moved, time, _gate(graph, name, steps, k), own), used)
         if num_nodes is not None and export.scale_columns != STRETCH_COLUMNS:
             step = _padded(graph, name, step, num_nodes)
         total = graph.node("Add", [total, step], f"{name}.deltas") if total else step

@@ -29,6 +29,10 @@ class SplineExport:
         raw = graph.node("Sub", [curves, graph.constant(f"{inputs.name}.rest", rest)], f"{inputs.name}.raw")
         return graph.node("Mul", [raw, inputs.gate], f"{inputs.name}.gated")
 
+    def point_constants(self, layer: DeformationLayer, points: np.ndarray) -> dict[str, np.ndarray]:
+        """None: a curve belongs to its node."""
+        return {}
+
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """No heads, since a curve translates, stretches and rotates."""
         return frozenset()

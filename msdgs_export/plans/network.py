@@ -38,7 +38,9 @@ def _deform(graph: GraphBuilder, baked: Baked, layout: Layout | None) -> None:
 
     steps = graph.constant("steps", np.array([len(baked.layers)], np.float32))
     attributes = moving.baked_attributes if rows.layout is None else rows.layout.attributes
-    inputs = SupportInputs(baked.support, baked.layers, means, quats, time, steps, attributes)
+    constants = export.constants(baked.layers, moving.means).items()
+    constants = {name: rows.of(name, values) for name, values in constants}
+    inputs = SupportInputs(baked.support, baked.layers, means, quats, time, steps, attributes, constants)
     plain = not moving.modulation and baked.scene.metadata.delta_space == "raw"
     poses = export.poses(graph, inputs, log_scales) if plain else None
     if poses is None:

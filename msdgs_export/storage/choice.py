@@ -51,6 +51,8 @@ GROUPS = {
         | _bits(in_range, 16),
     ),
     "planes": Group(r"layer\d+\.grid\d+\.(space|time)", _bits(in_range, 8, 16)),
+    "hash grids": Group(r"layer\d+\.now\.table", _bits(in_range, 8, 16)),
+    "features of points": Group(r"layer\d+\.canonical", _bits(in_range, 8, 16)),
     "functions of time": Group(r"functions\.control", _bits(in_range, 8, 16)),
     "leading coefficients": Group(r"coefficients\d+\.leading", _bits(in_range, 8, 16)),
     "coefficients": Group(r"coefficients\d+\.rest", _bits(in_range, 8, 16)),

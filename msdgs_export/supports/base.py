@@ -1,6 +1,7 @@
 """The interface of the export of a kind of support."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ class SupportInputs(NamedTuple):
     time: str  # [1, 1]
     steps: str  # [1] how many layers are applied
     attributes: Mapping[str, np.ndarray]  # a layout's, or `Support.baked` of all moving Gaussians
+    constants: Mapping[str, str] = MappingProxyType({})  # [R, …] by name, of `SupportExport.constants`
 
 
 class SupportExport:
@@ -43,6 +45,11 @@ class SupportExport:
         """The rows of a graph of all moving Gaussians, of canonical means [M, 3] and attributes `Support.baked`; None
         for a graph that poses the Gaussians asked for alone."""
         return None
+
+    def constants(self, layers: Sequence[DeformationLayer], means: np.ndarray) -> dict[str, np.ndarray]:
+        """Rows [M, …] by name that the graph reads of all moving Gaussians, of canonical means [M, 3], whatever the
+        time: what `point_constants` gives layers whose points they are."""
+        return {}
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         """Add the nodes of the chain and of the support. Returns the summed deltas of the rows by head, without heads

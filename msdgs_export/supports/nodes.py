@@ -10,7 +10,7 @@ import numpy as np
 from onnx import TensorProto
 
 from msdgs_export.layers.base import HEADS
-from msdgs_export.layers.chain import summed_deltas
+from msdgs_export.layers.chain import stored_constants, summed_deltas
 from msdgs_export.layers.graph import GraphBuilder, to_numpy
 from msdgs_export.supports.base import Layout, SupportExport, SupportInputs
 from msdgs_export.supports.blocks import block_layout
@@ -49,7 +49,9 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     support = cast(NodesSupport, inputs.support)
     positions = to_numpy(support.nodes)
     nodes = graph.constant("nodes", positions)
-    parts = summed_deltas(graph, inputs.layers, nodes, inputs.time, inputs.steps, list(HEADS), len(positions))
+    chain = inputs.layers, nodes, inputs.time, inputs.steps
+    constants = stored_constants(graph, inputs.layers, positions)
+    parts = summed_deltas(graph, *chain, list(HEADS), len(positions), constants)
     raw = graph.node("Add", [parts["quats"], graph.constant("nodes.identity", IDENTITY)], "nodes.raw_rots")
     rots = unit_rows(graph, "nodes.rots", raw)
     matrices = _stretching(graph, "nodes.matrices", rotation_columns(graph, "nodes.rotations", rots), parts["scales"])

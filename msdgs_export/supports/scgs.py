@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 
 from msdgs_export.layers.base import HEADS, ModelNotExportable
-from msdgs_export.layers.chain import summed_deltas
+from msdgs_export.layers.chain import stored_constants, summed_deltas
 from msdgs_export.layers.graph import GraphBuilder, to_numpy
 from msdgs_export.supports.base import Layout, SupportExport, SupportInputs
 from msdgs_export.supports.blocks import block_layout
@@ -56,8 +56,9 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     support = cast(SCGSSupport, inputs.support)
     if not support.is_placed:
         raise ModelNotExportable("the control nodes of this model aren't placed: train it past its first stage")
-    nodes, used = graph.constant("nodes", to_numpy(support.nodes)), [*HEADS, LOCAL_QUATS]
-    parts = summed_deltas(graph, inputs.layers, nodes, inputs.time, inputs.steps, used)
+    positions, used = to_numpy(support.nodes), [*HEADS, LOCAL_QUATS]
+    nodes, constants = graph.constant("nodes", positions), stored_constants(graph, inputs.layers, positions)
+    parts = summed_deltas(graph, inputs.layers, nodes, inputs.time, inputs.steps, used, constants=constants)
     raw = graph.node("Add", [parts[LOCAL_QUATS], graph.constant("nodes.identity", IDENTITY)], "nodes.raw_rots")
     matrices = rotation_columns(graph, "nodes.rotations", unit_rows(graph, "nodes.rots", raw))
     offsets = node_offsets(graph, nodes, parts["means"], matrices)

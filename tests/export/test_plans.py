@@ -33,7 +33,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, random_model
+from tests.support.models import HASH4D, MLP, NODES, PLANE, SCENE, SPLINE, random_model
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -43,6 +43,7 @@ ON_NODES = {"support": NODES, "noise": 0.02}
 FORMATS: dict[str, dict[str, Any]] = {
     "mlp": {"layers": (SLOW, SLOW), "noise": 0.02},
     "plane": {"layers": (COARSE,)},
+    "hash4d": {"layers": (HASH4D,), "scale_space": "linear", "weights": False, "noise": 0.02},
     "mixed": {"layers": (SLOW, COARSE), "noise": 0.02},
     "splines on nodes": {"layers": (SPLINE,), **ON_NODES},
     "mlp on nodes": {"layers": (SLOW, SLOW), **ON_NODES},

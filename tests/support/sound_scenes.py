@@ -18,11 +18,16 @@ from tests.support.splat_files import some_gaussians
 MODELS: dict[str, dict[str, Any]] = {
     "mlp": {"layers": ("mlp", "mlp")},
     "plane": {"layers": ("plane",)},
+    "hash4d": {"layers": ("hash4d",), "scale_space": "linear", "weights": False, "embedding_dim": 0},
     "mixed": {"layers": ("mlp", "plane"), "scale_space": "linear", "modulation_targets": ("means", "scales", "quats")},
     "spline on nodes": {"layers": ("spline",), "support": NODES},
+    "hash4d on nodes": {"layers": ("hash4d", "spline"), "support": NODES},
     "mixed on nodes": {"layers": ("plane", "spline", "mlp"), "support": NODES, "weights": False, "embedding_dim": 0},
     "static": {"layers": ()},
-    **{f"all heads of {kind}": {"layers": (kind,), "opacity_head": True, "sh_head": True} for kind in ("mlp", "plane")},
+    **{
+        f"all heads of {kind}": {"layers": (kind,), "opacity_head": True, "sh_head": True}
+        for kind in ("mlp", "plane", "hash4d")
+    },
 }
 PLANS = ("network", "prefix:1", "compact:40", "compact:60")
 RESOLVED = 1e-4
@@ -62,6 +67,7 @@ def _packed() -> Iterator[tuple[str, bytes]]:
     finest = {name: list(group.kinds)[-1] for name, group in GROUPS.items()}
     for name, plan in (
         ("mlp", "network"),
+        ("hash4d", "network"),
         ("mixed on nodes", "network"),
         ("mixed", "compact:60"),
         ("static", "network"),
