@@ -6,11 +6,10 @@ Of each kind of run, whose networks are read in a process that first loads torch
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import torch
 from rich.console import Console
 
 from msdgs_export.cli.export import export_or_import
@@ -23,7 +22,14 @@ from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_train.gaussians.model_file import CheckpointInvalid, load_model, save_model
-from tests.support.foreign_runs import deformgs_state, fourdgs_state, write_deformgs, write_fourdgs
+from tests.support.foreign_runs import (
+    deformgs_state,
+    fourdgs_state,
+    grid4d_states,
+    write_deformgs,
+    write_fourdgs,
+    write_grid4d,
+)
 from tests.support.fuzzing import CASES, IS_FRESH, SEED
 from tests.support.memory import measured
 from tests.support.models import SCENE, random_model
@@ -78,7 +84,7 @@ def read_frames(folder: Path, files: list[Path]) -> Gaussians:
     return DeformationSession(folder / "scene.onnx").gaussians(0.5)
 
 
-def run_of(kind: str, write_run: Callable[..., Path], state: dict[str, torch.Tensor]) -> Kind:
+def run_of(kind: str, write_run: Callable[..., Path], state: Any) -> Kind:
     """Return the kind of a run, of which the files of the last iteration are damaged that are read."""
 
     def make(folder: Path, g: Gaussians) -> list[Path]:
@@ -113,6 +119,7 @@ KINDS = {
     "sequence": Kind(frames, read_frames),
     "deformgs": run_of("deformgs", write_deformgs, deformgs_state(True)),
     "4dgs": run_of("4dgs", write_fourdgs, fourdgs_state((1,))),
+    "grid4d": run_of("grid4d", write_grid4d, grid4d_states()),
 }
 
 

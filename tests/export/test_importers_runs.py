@@ -1,4 +1,4 @@
-"""Import of runs of Deformable-3D-Gaussians and 4DGaussians, compared with their own networks."""
+"""Import of runs of Deformable-3D-Gaussians, 4DGaussians and Grid4D; the first two compared with their networks."""
 
 import json
 import zipfile
@@ -30,6 +30,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model
+from msdgs_train.layers.hash4d import Hash4DLayer
 from msdgs_train.layers.plane import PlaneConfig
 from tests.support import foreign_runs as foreign
 from tests.support.foreign_runs import COUNT, SWITCHES, State
@@ -237,6 +238,59 @@ def test_a_network_that_differs_is_named_before_memory_is_taken(
     built = on_which_device(monkeypatch)
     assert_refused(run, kind, message)
     assert set(built) <= {"meta"}
+
+
+GRID4D_CHANGES: list[tuple[int, State, str]] = [
+    (0, {"xyz_encoding.offsets": torch.tensor([0, 64, 320, 577])}, "`0.xyz_encoding.offsets` aren't those of levels"),
+    (0, {"yzt_encoding.offsets": torch.tensor([0, 48])}, r"`0.yzt_encoding.offsets` has shape \(2,\), not 3"),
+    (0, {"xyt_encoding.offsets": torch.zeros(1)}, r"`0.xyt_encoding.offsets` has 1 rows, of two levels or more"),
+    (0, {"xyz_encoding.per_level_scale": torch.full((3,), 1e9)}, r"`0.xyz_encoding.per_level_scale` gives"),
+    (0, {"xyz_encoding.base_resolution": torch.ones(3)}, r"`model.layers.0.canonical_coarsest` must be"),
+    (0, {"xyz_encoding.embeddings": torch.zeros(9, 2)}, r"`0.xyz_encoding.embeddings` has shape \(9, 2\)"),
+    (1, {"spatial_mlp.0.bias": torch.zeros(50_000)}, r"`model.layers.0.width` must be at most 4,096"),
+    (1, {"gaussian_warp.weight": torch.zeros(3, 12)}, r"`1.gaussian_warp.weight` has shape \(3, 12\), not 7 × 12"),
+    (1, {"grid_mlp.2.weight": torch.zeros(12, 12)}, r"lacks `1.grid_mlp.2.bias`"),
+]
+
+
+@pytest.mark.parametrize(("part", "change", "message"), GRID4D_CHANGES)
+def test_a_network_of_grid4d_that_differs_is_named_before_memory_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int, change: State, message: str
+):
+    states = foreign.grid4d_states()
+    states[part] |= change
+    built = on_which_device(monkeypatch)
+    assert_refused(foreign.write_grid4d(tmp_path / "run", states), "grid4d", message)
+    assert set(built) <= {"meta"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "half_sizes"),
+    [
+        ("grid_args={'bound': 2.0, 'levels': 3}, scale_xyz=[1.0, 0.5, 2.0]", [2.0, 4.0, 1.0]),
+        ("grid_args={'bound': 3}, network_args={'depth': 1, 'directional': True}", [3.0, 3.0, 3.0]),
+        ("white_background=True", [1.6, 1.6, 1.6]),
+    ],
+)
+def test_the_box_of_grid4d_is_that_of_its_settings(tmp_path: Path, settings: str, half_sizes: list[float]):
+    run = foreign.write_grid4d(tmp_path / "run", foreign.grid4d_states(), settings)
+    model, (lost,) = imported(run, "grid4d")
+    assert (lost["rule"], lost["count"]) == ("quaternion_fidelity", COUNT)
+    layer = model.deformation.layers[0]
+    assert isinstance(layer, Hash4DLayer)
+    assert layer.half_sizes.tolist() == pytest.approx(half_sizes)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ("network_args={'directional': False}", "directional=False"),
+        ("grid_args={'bound': 'wide'}", "bound='wide' and scale_xyz=1.0, not positive numbers"),
+        ("scale_xyz=[1.0, 2.0]", r"scale_xyz=\[1.0, 2.0\], not positive numbers"),
+    ],
+)
+def test_settings_of_grid4d_that_make_another_network_are_named(tmp_path: Path, settings: str, message: str):
+    assert_refused(foreign.write_grid4d(tmp_path / "run", foreign.grid4d_states(), settings), "grid4d", message)
 
 
 def test_switches_that_make_another_network_are_named(tmp_path: Path):

@@ -192,7 +192,7 @@ def test_frames_that_differ_in_what_is_up_are_refused(tmp_path: Path):
         read_sequence(frames(tmp_path, "Vertical Axis: z", "Vertical Axis: y"))
 
 
-@pytest.mark.parametrize("file_format", ["model", "deformgs", "4dgs"])
+@pytest.mark.parametrize("file_format", ["model", "deformgs", "4dgs", "grid4d"])
 def test_trained_models_have_no_such_option(tmp_path: Path, file_format: str):
     with pytest.raises(InvalidInput, match=r"`up` must be left out: it is for splats"):
         export_or_import(ExportOptions(tmp_path, tmp_path / "a.onnx", file_format, up="z"), QUIET)

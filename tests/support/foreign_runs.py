@@ -1,4 +1,4 @@
-"""Runs of Deformable-3D-Gaussians and 4DGaussians with small random networks, reimplemented in a few lines."""
+"""Runs of Deformable-3D-Gaussians, 4DGaussians and Grid4D with small random networks, reimplemented in a few lines."""
 
 import itertools
 import json
@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from msdgs_serve.scene.camera import orbit
+from msdgs_train.layers.hash_kernels import Levels
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 
 COUNT = 50
@@ -144,3 +145,43 @@ def stored_camera(index: int) -> dict[str, object]:
     pose = orbit(np.zeros(3), 4.0, 90 * index, 10, np.array([0.0, -1.0, 0.0]))
     size = {"width": 96, "height": 96, "fx": 96.0, "fy": 96.0}
     return {"img_name": f"{index}", "rotation": pose[:3, :3].tolist(), "position": pose[:3, 3].tolist(), **size}
+
+
+def grid4d_states(width: int = 12, depth: int = 1, seed: int = 0) -> list[State]:
+    """Small grids of Grid4D, of which the finest levels are hashed, and a network."""
+    grids: State = {}
+    network: State = {}
+    add, _ = _random_layers(network)
+    generator = torch.Generator().manual_seed(seed)
+    for name, sizes in (
+        ("xyz", (3, (4, 4, 4), (17, 17, 17), 2**8)),
+        *((name, (2, (4, 4, 3), (9, 9, 5), 2**7)) for name in ("xyt", "yzt", "xzt")),
+    ):
+        count, coarsest, finest, _ = sizes
+        starts = torch.from_numpy(Levels.between(*sizes).starts)
+        ratios = [(last / first) ** (1 / (count - 1)) for first, last in zip(coarsest, finest, strict=True)]
+        grids |= {
+            f"{name}_encoding.embeddings": torch.rand(int(starts[-1]), 2, generator=generator) - 0.5,
+            f"{name}_encoding.offsets": starts.int(),
+            f"{name}_encoding.per_level_scale": torch.tensor(ratios),
+            f"{name}_encoding.base_resolution": torch.tensor(coarsest).float(),
+        }
+    add("spatial_mlp.0", 6, width)
+    add("temporal_mlp.0", 12, width)
+    for i in range(depth):
+        add(f"grid_mlp.{2 * i}", width, width)
+    for name, size in (("gaussian_warp", 7), ("gaussian_rotation", 4), ("gaussian_scaling", 3)):
+        add(name, width, size, 0.2)
+    return [grids, network]
+
+
+def write_grid4d(folder: Path, states: list[State], settings: str = "grid_args={'bound': 1.6}") -> Path:
+    """Write a run of Grid4D, whose file has the states of its grids and of its network."""
+    cloud = folder / "point_cloud" / "iteration_50000"
+    network = folder / "deform" / "iteration_50000"
+    for part in (cloud, network):
+        part.mkdir(parents=True)
+    (cloud / "point_cloud.ply").write_bytes(ply_bytes(inria_columns(some_gaussians(COUNT, 3))))
+    torch.save(tuple(states), network / "deform.pth")
+    (folder / "cfg_args").write_text(f"Namespace(sh_degree=3, {settings})")
+    return folder

@@ -16,6 +16,7 @@ from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.runs.base import RunImporter
 from msdgs_export.importers.runs.deformgs import DeformGSImporter
 from msdgs_export.importers.runs.fourdgs import FourDGSImporter
+from msdgs_export.importers.runs.grid4d import Grid4DImporter
 from msdgs_export.importers.runs.scgs import SCGSImporter
 from msdgs_export.importers.runs.state import RunFolder, stores
 from msdgs_export.importers.scene import metadata_of
@@ -30,6 +31,7 @@ from msdgs_train.gaussians.model_file import SceneInfo, save_model
 
 RUNS: dict[str, RunImporter] = {
     "scgs": SCGSImporter(),
+    "grid4d": Grid4DImporter(),
     "deformgs": DeformGSImporter(),
     "4dgs": FourDGSImporter(),
 }

@@ -3,7 +3,7 @@
 import ast
 import copy
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ PICKLE_BYTES = 1 << 24
 
 
 class State:
-    """The finite tensors of a torch file by name, as float32."""
+    """The finite tensors of a torch file by name, as float32; names of several states begin with `0.`, `1.` and so
+    on."""
 
     def __init__(self, file: Path) -> None:
         self.file = file
@@ -69,6 +70,8 @@ def read_network(file: Path) -> dict[str, np.ndarray]:
     """
     try:
         values = load(file)
+        if isinstance(values, tuple | list) and all(isinstance(part, Mapping) for part in values):
+            values = {f"{i}.{name}": value for i, part in enumerate(values) for name, value in part.items()}
         if not isinstance(values, Mapping) or not all(isinstance(v, Tensor) for v in values.values()):
             raise ImportFailed(file, "isn't the state of a network: tensors by name")
         refuse_unlike_stored(file, values)
@@ -112,4 +115,13 @@ def _settings(file: Path) -> dict[str, Any]:
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise ImportFailed(file, f"can't be read: {error}") from error
     keywords = call.keywords if isinstance(call, ast.Call) else ()
-    return {str(k.arg): k.value.value for k in keywords if isinstance(k.value, ast.Constant)}
+    return dict(_literals(keywords))
+
+
+def _literals(keywords: Iterable[ast.keyword]) -> Iterator[tuple[str, Any]]:
+    """Names and values of those that are constants, or lists and dictionaries of constants."""
+    for keyword in keywords:
+        try:
+            yield str(keyword.arg), ast.literal_eval(keyword.value)
+        except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
+            continue
