@@ -24,9 +24,9 @@ MLPs start as 100,000."""
 NEVER = 1e6  # times the scene's scale: 4DGaussians prunes only from 200,000 Gaussians on
 
 
-def _published(config: TrainConfig, model: ModelConfig) -> TrainConfig:
-    """What both loops have: no growing window, no clip, gray Gaussians at the start, INRIA's rasterizer; rounds of
-    density control are after step 500 and before 15,000."""
+def published(config: TrainConfig, model: ModelConfig) -> TrainConfig:
+    """What these loops have in common: no growing window, no clip, gray Gaussians at the start, INRIA's rasterizer;
+    rounds of density control are after step 500 and before 15,000."""
     steps = config.run.steps
     return config.updated(
         model=replace(model, near_plane=INRIA.near_plane, alpha_max=INRIA.alpha_max),
@@ -39,7 +39,7 @@ def _published(config: TrainConfig, model: ModelConfig) -> TrainConfig:
 
 
 def _deformgs(model: ModelConfig) -> TrainConfig:
-    return _published(PUBLISHED, replace(model, scale_space="linear")).updated(
+    return published(PUBLISHED, replace(model, scale_space="linear")).updated(
         static_fraction=2_999 / 40_000,
         means_lr_until_fraction=30_000 / 40_000,
         max_gaussians=NO_CAP,
@@ -77,7 +77,7 @@ assert isinstance(_GRIDS, PlaneConfig)
 register_system(
     "4dgs-faithful",
     "4DGaussians with its own loop of two stages",
-    _published(
+    published(
         FOURDGS, replace(FOURDGS.model, layers=(replace(_GRIDS, initialization="xavier", smooths_one_axis=True),))
     ).updated(restart_at_motion=True, max_gaussians=360_000, prune_opa=0.0, prune_scale3d=NEVER),
 )

@@ -50,6 +50,8 @@ def in_millions(count: float) -> float:
         ("deformgs", 522_280),
         ("4dgs", 3_365_770),
         ("sc-gs", 522_280 + 1_028),
+        ("grid4d", 13_224_948),
+        ("grid4d-small", 1_210_094),
         ("static", 0),
     ],
 )
@@ -63,6 +65,18 @@ def test_published_schedules() -> None:
         assert schedule.sh_degree_interval == 1_000
         assert (schedule.refine_start, schedule.refine_every, schedule.refine_stop) == (500, 100, 15_000)
         assert (schedule.static_steps, schedule.reset_every) == (3_000, 3_000)
+
+
+def test_published_schedule_of_grid4d() -> None:
+    config = preset("grid4d")
+    schedule = Schedule.from_config(config)
+    assert (schedule.num_steps, schedule.static_steps, schedule.full_window_step) == (50_000, 2_999, 0)
+    assert (schedule.refine_start, schedule.refine_every, schedule.refine_stop) == (501, 100, 14_999)
+    assert (schedule.sh_degree_interval, schedule.reset_every) == (1_000, 3_000)
+    (layer,) = DynamicGaussians(config.model, CanonicalGaussians.random_in_cube(3, 1.0, 3, 0)).deformation
+    for group, final in zip(layer.parameter_groups(), (8e-5, 1.6e-6), strict=True):
+        assert group.lr.at(45_000, 50_000, 0) == pytest.approx(final)
+        assert group.lr.at(44_000, 50_000, 0) > final
 
 
 def test_table_4() -> None:
