@@ -44,8 +44,8 @@ def verify(
     Only the plan `network` is held to `tolerance`; others are measured. The file may hold more Gaussians than the
     model, static ones after all others, which aren't compared. Errors of means are relative to the scene's half
     diagonal or, further out, to the largest coordinate; those of scales to the Gaussian's largest scale; those of
-    quaternions are absolute. Raises `VerificationFailed` if one is above `tolerance` for a stable Gaussian. Unstable
-    Gaussians are evaluated in rendered frames, before a file is written.
+    quaternions are absolute, or of covariances with `quat_space` raw. Raises `VerificationFailed` if one is above
+    `tolerance` for a stable Gaussian. Unstable Gaussians are evaluated in rendered frames, before a file is written.
     """
     stated = session.scene.metadata
     if stated.plan != BASELINE:
@@ -53,7 +53,7 @@ def verify(
     double, count, size = copy.deepcopy(model).double(), len(model.gaussians), half_diagonal(stated.bounds)
     stride = max(1, min(times, math.ceil(count / GAUSSIANS_PER_TIME)))
     distances, unstable, unstable_worst = [], np.zeros(count, bool), 0.0
-    outputs = session.scene.posed_outputs
+    outputs, by_shape = session.scene.posed_outputs, model.config.quat_space == "raw"
     worst: dict[str, dict[str, float]] = {p: dict.fromkeys(outputs, 0.0) for p in ("float64", "float32")}
     _check_opacities_and_sh(session, double, min(tolerance, TOLERANCE))  # constants under every plan
     for i, t in enumerate(times_to_verify(*stated.time_range, times)):
@@ -62,11 +62,11 @@ def verify(
         got = _posed_by_file(session, t, ids)
         _give_sign_of(poses["float64"].quats, got.quats)
         distances.append(_distances(got, poses["float64"]))
-        own = largest_error(pose_errors(poses["float32"], poses["float64"], size, outputs))
+        own = largest_error(pose_errors(poses["float32"], poses["float64"], size, outputs, by_shape=by_shape))
         stable = own <= UNSTABLE * tolerance
         unstable[ids[~stable]] = True
         for precision, reference in poses.items():
-            for name, errors in pose_errors(got, reference, size, outputs).items():
+            for name, errors in pose_errors(got, reference, size, outputs, by_shape=by_shape).items():
                 unstable_worst = max(unstable_worst, float(errors[~stable].max(initial=0)))
                 error = float(errors[stable].max(initial=0))
                 worst[precision][name] = max(worst[precision][name], error)

@@ -9,6 +9,7 @@ import torch
 
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.gaussians import Gaussians
+from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.supports.base import Support
@@ -65,12 +66,20 @@ def half_diagonal(bounds: object) -> float:
 
 
 def pose_errors(
-    got: Gaussians, expected: Gaussians, scene_size: float, outputs: Sequence[str] = MOVING_OUTPUTS
+    got: Gaussians,
+    expected: Gaussians,
+    scene_size: float,
+    outputs: Sequence[str] = MOVING_OUTPUTS,
+    *,
+    by_shape: bool = False,
 ) -> dict[str, np.ndarray]:
     """[M] the largest error of each Gaussian, by output; infinite if `got` is NaN or infinite.
 
     Means: relative to the scene's half diagonal or, further out, to the largest coordinate. Quaternions: absolute.
     Scales: relative to the Gaussian's largest scale, or to `SMALLEST_VISIBLE` of the scene. Opacities and SH: absolute.
+
+    With `by_shape`, errors of covariances, relative to the largest variance, stand for those of quaternions: axes of
+    equal length have no direction, if those are found from the shape (`unit_form`).
     """
     sizes = {
         "means": np.maximum(np.abs(expected.means).max(axis=1), scene_size),
@@ -81,7 +90,16 @@ def pose_errors(
         differences = {n: np.abs(getattr(got, n).astype(np.float64) - getattr(expected, n)) for n in outputs}
         largest = {name: values.max(axis=tuple(range(1, values.ndim))) for name, values in differences.items()}
         errors = {name: values / sizes[name] for name, values in largest.items()}
+        if by_shape:
+            off = np.abs(_covariances(got) - _covariances(expected)).max(axis=(1, 2))
+            errors["quats"] = off / np.square(sizes["scales"])
     return {name: np.where(np.isfinite(values), values, math.inf) for name, values in errors.items()}
+
+
+def _covariances(gaussians: Gaussians) -> np.ndarray:
+    """[M, 3, 3] float64."""
+    halves = to_matrix(gaussians.quats.astype(np.float64)) * gaussians.scales.astype(np.float64)[:, None]
+    return halves @ halves.transpose(0, 2, 1)
 
 
 def largest_error(errors: dict[str, np.ndarray]) -> np.ndarray:

@@ -54,6 +54,26 @@ def test_plans_that_sample_poses_read_the_unit_form() -> None:
     assert build("network", baked).graph.output[1].name == "quats"
 
 
+def test_axes_of_equal_length_have_no_direction(tmp_path: Path) -> None:
+    """Rotations of the file differ from the model's, shapes don't."""
+    model = random_model(300, 1, noise=0.0, layers=(MLP,), **SWITCHES)
+    with torch.no_grad():
+        model.get_parameter("deformation.layers.0.heads.bias").copy_(torch.linspace(-0.1, 0.1, 11))
+        model.gaussians.raw_quats.normal_(generator=torch.Generator().manual_seed(2))
+        model.get_parameter("gaussians.log_scales").add_(
+            1e-4 * torch.randn(300, 3, generator=torch.Generator().manual_seed(3))
+        )
+        model.get_parameter("deformation.layers.0.heads.bias")[3:6] = 0.0
+    exported = export_scene(saved(tmp_path, model), tmp_path / "scene.onnx", times=3)
+    assert exported.measured_error["quats"] <= tolerance("export.relative")
+    session = DeformationSession(tmp_path / "scene.onnx")
+    with torch.no_grad():
+        expected = model.double().pose(0.5)
+    got, wanted = session.gaussians(0.5).quats, expected.quats.numpy()
+    chords = np.linalg.norm(got * np.sign((got * wanted).sum(axis=1, keepdims=True)) - wanted, axis=1)
+    assert float(chords.max()) > 10 * tolerance("export.relative"), "some have turned"
+
+
 def test_a_file_names_the_limits_that_it_does_not_hold() -> None:
     for near, most, named in ((0.01, 0.999, []), (0.2, 0.99, ["rasterizer"])):
         model = random_model(30, layers=(MLP,), near_plane=near, alpha_max=most)
