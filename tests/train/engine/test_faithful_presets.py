@@ -114,18 +114,18 @@ def test_total_variation_as_in_hexplane() -> None:
         for plane in planes.detach().numpy():
             for axis, weight in enumerate(weights):
                 expected += 2 * weight * float(np.mean(np.diff(plane, axis=axis) ** 2))
-    assert float(grid.total_variation()) == pytest.approx(expected, rel=tolerance("rotation"))
+    assert grid.total_variation().item() == pytest.approx(expected, rel=tolerance("rotation"))
     layer = PlaneLayer(dataclasses.replace(PLANE, time_smoothness_weight=0.0, plane_tv_weight=0.0, tv_weight=3.0))
     terms = layer.regularizers(torch.zeros(1, 3), torch.tensor(0.5), torch.Generator())
-    wanted = pytest.approx(3 * float(layer.plane_grids()[0].total_variation()))
-    assert {name: float(term) for name, term in terms.items()} == {"tv_0": wanted}
+    wanted = pytest.approx(3 * layer.plane_grids()[0].total_variation().item())
+    assert {name: term.item() for name, term in terms.items()} == {"tv_0": wanted}
 
 
 def test_smoothness_of_4dgaussians_is_along_the_second_axis() -> None:
     grid = PlaneGrid(2, 6, 5, 1.0, (0.0, 1.0)).double()
     second = np.diff(grid.space.detach().numpy(), n=2, axis=2)
-    assert float(grid.plane_smoothness(one_axis=True)) == pytest.approx(float(np.mean(second**2)))
-    assert float(grid.plane_smoothness()) > float(grid.plane_smoothness(one_axis=True))
+    assert grid.plane_smoothness(one_axis=True).item() == pytest.approx(float(np.mean(second**2)))
+    assert grid.plane_smoothness().item() > grid.plane_smoothness(one_axis=True).item()
 
 
 def test_times_get_noise_that_falls_to_nothing(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
