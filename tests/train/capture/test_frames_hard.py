@@ -142,8 +142,6 @@ def test_hdr_is_said(tmp_path: Path):
         tmp_path / "a.mp4",
         pictures(2),
         pixels="yuv420p10le",
-        codec="libx265",
-        options={"x265-params": "log-level=none"},
         colors=colors,
     )
     assert "a.mp4 is HDR (HLG)" in extract_frames([clip], tmp_path / "out").notes[0]
