@@ -2,7 +2,7 @@
 
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from benchmarks.paper.tables import PaperBudget, Table, find_scenes, read_systems, read_table
+from benchmarks.paper.tables import PaperBudget, find_scenes, read_systems, read_table
 from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID, begin
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.writing import in_words, write_text
@@ -86,8 +86,9 @@ class Paper:
         if self.jobs < 1:
             raise InvalidInput("jobs", "1 or more", self.jobs)
         table = read_table(self.table)
-        self._check_names(table)
         scenes = find_scenes(table, self.data)
+        require_known("methods", self.methods, [method.name for method in table.methods])
+        require_known("scenes", self.scenes, [scene.name for scene in scenes])
         trained, absent = read_systems(table, self.budget, small=self.small)
         csv = self.csv or self.out / "paper.csv"
         runs = make_runs(dict(trained.values()), scenes, self.seeds, self.out)
@@ -114,12 +115,6 @@ class Paper:
             return EXIT_INTERRUPTED
         return EXIT_INVALID if runs_left(chosen, csv) else 0
 
-    def _check_names(self, table: Table) -> None:
-        known = [method.name for method in table.methods]
-        for name in self.methods:
-            if name not in known:
-                raise InvalidInput("methods", f"of {', '.join(known)}", name)
-
     def _write(self, results: "Results") -> None:
         from benchmarks.paper.page import sections
         from benchmarks.paper.sections import as_html, as_markdown
@@ -130,6 +125,13 @@ class Paper:
         write_text(self.out / f"{self.table}.html", as_html(results.title, parts))
         for file in (self.out / f"{self.table}.md", *([self.docs] if self.docs else [])):
             write_text(file, text)
+
+
+def require_known(option: str, names: Sequence[str], known: Sequence[str]) -> None:
+    """Raise `InvalidInput` naming the first that isn't known."""
+    for name in names:
+        if name not in known:
+            raise InvalidInput(option, f"of {', '.join(known)}", name)
 
 
 def self_test() -> int:
@@ -154,9 +156,20 @@ def self_test() -> int:
         assert "Ours(MLP) over DeformGS" in text
         assert page.count("data:image/png") == 3
         for name in ("table2", "table3", "table4", "table5", "figure7"):
-            assert read_table(name).methods
+            assert refused(replace(paper, table=name, methods=("none",))) == "methods"
+        assert refused(replace(paper, methods=(), scenes=("none",))) == "scenes"
+        assert refused(replace(paper, data=())) == "data"
     console.print("ok")
     return 0
+
+
+def refused(paper: Paper) -> str | None:
+    """The field that a command refuses."""
+    try:
+        paper.execute()
+    except InvalidInput as error:
+        return error.field
+    return None
 
 
 @contextmanager
@@ -168,7 +181,9 @@ def errors_in_words() -> Iterator[None]:
         Console(stderr=True).print("interrupted")
         sys.exit(EXIT_INTERRUPTED)
     except (MsdgsError, OSError) as error:
-        Console(stderr=True).print(f"error: {in_words(error)}", style="red", markup=False, highlight=False)
+        Console(stderr=True).print(
+            f"error: {in_words(error)}", style="red", markup=False, highlight=False, soft_wrap=True
+        )
         sys.exit(EXIT_INVALID)
 
 

@@ -67,11 +67,10 @@ def read_table(name: str) -> Table:
     return Table(name, methods=methods, **contents)
 
 
-def find_scenes(table: Table, sources: Sequence[Path], names: Sequence[str] = ()) -> list[Scene]:
-    """The scenes of TOML files, of datasets, and of folders with the table's scenes in them, or those of the given
-    names. Those of the table have its names.
+def find_scenes(table: Table, sources: Sequence[Path]) -> list[Scene]:
+    """The scenes of TOML files, of datasets, and of folders with the table's scenes in them, which have its names.
 
-    Raises `InvalidInput` naming what is unknown or missing.
+    Raises `InvalidInput` naming what is missing.
     """
     if not sources:
         raise InvalidInput("data", f"the folder of {table.dataset}, datasets or TOML files of scenes", "none")
@@ -80,11 +79,7 @@ def find_scenes(table: Table, sources: Sequence[Path], names: Sequence[str] = ()
     for source in sources:
         inside = sorted(source.iterdir()) if source.is_dir() else []
         folders += [folder for folder in inside if folder.is_dir() and _plain(folder.name) in spelled] or [source]
-    found = [replace(scene, name=spelled.get(_plain(scene.name), scene.name)) for scene in read_scenes(folders)]
-    unknown = [name for name in names if name not in {scene.name for scene in found}]
-    if unknown:
-        raise InvalidInput("scenes", f"of {', '.join(scene.name for scene in found)}", unknown[0])
-    return [scene for scene in found if not names or scene.name in names]
+    return [replace(scene, name=spelled.get(_plain(scene.name), scene.name)) for scene in read_scenes(folders)]
 
 
 def read_systems(table: Table, budget: Budget, *, small: bool) -> tuple[dict[str, tuple[str, TrainConfig]], list[str]]:
