@@ -92,7 +92,7 @@ class Fit:
                     observer=observer,
                     tensorboard=self.tensorboard,
                 )
-            print_result(result, self.data, self.run)
+            print_result(result, self.data, self.run, progress.elements)
             if view is not None and result.status != "interrupted":
                 with contextlib.suppress(KeyboardInterrupt):
                     console.print("the viewer shows the last model; Ctrl-C closes it")

@@ -18,6 +18,7 @@ from msdgs_train.engine.run import RunResult
 from msdgs_train.engine.run_record import BEST, MODEL
 from msdgs_train.engine.trainer import StepResult, Trainer
 from msdgs_train.evaluation.metrics import ImageMetrics
+from msdgs_train.systems.base import RaySystem
 
 UPDATE_SECONDS = 0.5
 PLAIN_LINE_SECONDS = 10.0  # between lines if the output is not a terminal
@@ -32,6 +33,8 @@ class FitProgress(Observer):
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
+        self.elements = "Gaussians"
+        """What the model is made of."""
         self._stop = threading.Event()
         self._first: tuple[int, float] | None = None  # step and time that the speed is measured from
         self._taken = 0  # optimizer steps since then; with `minutes` each stands for several steps of the schedule
@@ -55,7 +58,10 @@ class FitProgress(Observer):
         self._print(summary(trainer.scene))
         for warning in trainer.scene.warnings:
             self._print(f"warning: {warning}", style="yellow")
-        phases = trainer.schedule.phases()
+        if isinstance(trainer.system, RaySystem):
+            self.elements, phases = "vertices", []
+        else:
+            phases = trainer.schedule.phases()
         width = max((len(phase.name) for phase in phases), default=0)
         for phase in phases:
             self._print(f"{phase.name:{width}}  steps {phase.first + 1:,} to {phase.stop:,}")
@@ -72,7 +78,7 @@ class FitProgress(Observer):
         self._next_update = now + (UPDATE_SECONDS if console.is_terminal else PLAIN_LINE_SECONDS)
         elapsed = max(now - self._first[1], 1e-9)
         pace = (result.step - self._first[0]) / elapsed
-        state = f"loss {result.loss:.4f}  PSNR {result.psnr:.2f} dB  {result.gaussians:,} Gaussians"
+        state = f"loss {result.loss:.4f}  PSNR {result.psnr:.2f} dB  {result.gaussians:,} {self.elements}"
         state += f"  {self._taken / elapsed:.1f} steps/s" if self._taken else ""
         state += f"  {result.skipped} skipped" if result.skipped else ""
         self._bar.update(self._task, completed=result.step, state=state)
@@ -101,9 +107,10 @@ class FitProgress(Observer):
         self._stop.set()
 
 
-def print_result(result: RunResult, data: Path, run: Path) -> None:
-    """Print the run's status, metrics and models, and the command that continues it."""
-    console.print(f"{result.status} at step {result.step:,}, {result.gaussians:,} Gaussians, {result.seconds:.0f} s")
+def print_result(result: RunResult, data: Path, run: Path, elements: str) -> None:
+    """Print the run's status, metrics and models, and the command that continues it; `elements` names what models are
+    made of."""
+    console.print(f"{result.status} at step {result.step:,}, {result.gaussians:,} {elements}, {result.seconds:.0f} s")
     for split, metrics in result.metrics.items():
         console.print(f"{split:>5}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}")
     console.print(f"model: {run / MODEL}", soft_wrap=True)

@@ -15,9 +15,7 @@ from msdgs_train.comparison.runner import final_metrics, is_finished
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.engine.run import EVAL_SPLITS
 from msdgs_train.engine.run_record import MODEL
-from msdgs_train.gaussians.model import DynamicGaussians
-from msdgs_train.gaussians.model_file import LoadedModel, load_model
-from msdgs_train.gaussians.modulation import EMBEDDINGS
+from msdgs_train.gaussians.stored import StoredModel, load_stored
 
 TIMED_FRAMES = 8
 
@@ -38,7 +36,7 @@ class Result:
     split: str
     psnr: float  # dB
     ssim: float
-    deformation_parameters: int
+    deformation_parameters: int  # of a volume all
     modulation_parameters: int  # embeddings included
     gaussians: int
     seconds: float  # training time, evaluations included
@@ -56,15 +54,15 @@ def _result(run: Run) -> Result:
     metrics = final_metrics(run) or {}
     split = next(name for name in EVAL_SPLITS if name in metrics["splits"] and name in run.splits)
     lines = read_metrics(run.folder)
-    loaded = load_model(run.folder / MODEL)
-    deformation, modulation = parameter_counts(loaded.model)
+    loaded = load_stored(run.folder / MODEL)
+    counts = loaded.parameter_counts
     return Result(
         run=run,
         split=split,
         psnr=metrics["splits"][split]["psnr"],
         ssim=metrics["splits"][split]["ssim"],
-        deformation_parameters=deformation,
-        modulation_parameters=modulation,
+        deformation_parameters=counts.motion,
+        modulation_parameters=counts.modulation,
         gaussians=metrics["gaussians"],
         seconds=metrics["seconds"],
         skipped=max((line["skipped"] for line in lines if line["kind"] == "train"), default=0),
@@ -73,16 +71,7 @@ def _result(run: Run) -> Result:
     )
 
 
-def parameter_counts(model: DynamicGaussians) -> tuple[int, int]:
-    """Trainable numbers of the deformation, and of the modulation with its embeddings."""
-    deformation = sum(p.numel() for p in model.deformation.parameters())
-    if model.modulation is None:
-        return deformation, 0
-    modulation = sum(p.numel() for p in model.modulation.parameters())
-    return deformation, modulation + model.gaussians.attributes[EMBEDDINGS].numel()
-
-
-def frame_milliseconds(loaded: LoadedModel, threads: int) -> float:
+def frame_milliseconds(loaded: StoredModel, threads: int) -> float:
     """Return the median frame time over some of its cameras, after an untimed frame, with `threads` of torch."""
     torch.set_num_threads(threads)
     times = []

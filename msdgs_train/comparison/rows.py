@@ -16,7 +16,6 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import write_text
 from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import Pool, RunEnd
-from msdgs_train.comparison.results import parameter_counts
 from msdgs_train.comparison.runner import final_metrics, train_all
 from msdgs_train.comparison.scenes import SPLITS
 from msdgs_train.engine.metrics_log import read_metrics
@@ -112,7 +111,7 @@ def measure(run: Run) -> Row:
     for split in SPLITS:
         if split in run.splits and split in metrics["splits"]:
             evaluation = evaluate_run(run.folder, run.data, split, brief=True)
-            counts = parameter_counts(evaluation.models[0].loaded.model)
+            counts = evaluation.models[0].loaded.parameter_counts
             row |= dict(zip(("parameters", "modulation_parameters"), map(str, counts), strict=True))
             row |= {f"{split}_{name}": value for name, value in _scores(evaluation).items()}
     return {name: row.get(name, "") for name in COLUMNS}

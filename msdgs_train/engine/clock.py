@@ -17,13 +17,13 @@ class Clock:
         self._position = float(step)
         self._image_seconds: float | None = None
 
-    def advance(self, step: int, step_seconds: float, images: int, seconds: float) -> int:
+    def advance(self, step: int, step_seconds: float, images: float, seconds: float) -> int:
         """Steps of the schedule that the next optimizer step stands for, 0 or more.
 
         Args:
             step: steps of the schedule that are done.
             step_seconds: time of the last optimizer step.
-            images: that it rendered.
+            images: that take as long to evaluate.
             seconds: time since the run began.
         """
         last = step_seconds / images

@@ -13,16 +13,16 @@ from msdgs_train.systems.targets import Target
 
 
 class ViewGradients(NamedTuple):
-    """One image of a batch after its backward pass."""
+    """One image of a batch, or a batch of rays, after its backward pass."""
 
-    frame: Frame
+    frame: Frame | None  # None: rays of several
     view: ViewLoss
     loss: Tensor
     squared_error: Tensor  # mean over channels and the pixels that count
     gradients: dict[int, Tensor]  # by id of the parameter; those that the loss depends on
 
 
-def differentiate(groups: Sequence[ParamGroup], frame: Frame, view: ViewLoss, target: Target) -> ViewGradients:
+def differentiate(groups: Sequence[ParamGroup], frame: Frame | None, view: ViewLoss, target: Target) -> ViewGradients:
     """The gradients of the parameters that the loss depends on."""
     parameters = [p for group in groups for p in group.params]
     found = torch.autograd.grad(view.loss, parameters, allow_unused=True)

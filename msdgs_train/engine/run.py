@@ -213,7 +213,7 @@ class Run:
             taken = self._now() - before
             self._after_step(result)
             if self.clock:
-                images = self.config.run.batch_size
+                images = self.trainer.images_per_step
                 self.advance = self.clock.advance(result.step, taken, images, self._seconds())
             if result.step < steps and self._is_stopped():
                 return "interrupted"

@@ -14,6 +14,7 @@ from torch.nn.utils import clip_grad_norm_
 from msdgs_serve.threads import sharing_cores
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.datasets.cache import ImageCache
+from msdgs_train.datasets.rays import RayBatch, RayBatches
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum import WindowCurriculum
 from msdgs_train.engine.gradients import ViewGradients, average_gradients, differentiate
@@ -26,7 +27,7 @@ from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.parameters import ParamGroup
 from msdgs_train.layers.precision import trunk_precision
-from msdgs_train.systems.base import Moment, System
+from msdgs_train.systems.base import ImageSystem, Moment, RaySystem
 from msdgs_train.systems.registry import system_of
 from msdgs_train.systems.targets import Target, TrainingImages
 
@@ -34,6 +35,7 @@ FORMAT = "msdgs-checkpoint/3"
 READ_EVERY = 20  # steps at most between looks at the results of steps on a GPU
 ROLLBACK_LR = 0.5  # factor of the learning rates, each time that training returns to a checkpoint
 ROLLBACK_SEED = 1_000_003  # added to the seed of the images' order
+RENDERED_PER_STEP = 3.0  # times that its rays are rendered while a step on rays is taken
 
 
 class StepResult(NamedTuple):
@@ -69,6 +71,10 @@ class Trainer:
         resident = 0 if self._is_on_host else round(run.gpu_image_memory * 2**30)
         self._training_images = TrainingImages(self._images, run.device, resident)
         self._reset()
+        self._rays = None
+        if isinstance(self.system, RaySystem):
+            training, size = scene.splits["train"], self.system.rays_per_batch
+            self._rays = RayBatches(training, size, config.run.device, self.system.hits)
 
     def _reset(self) -> None:
         """The state before the first step."""
@@ -77,7 +83,7 @@ class Trainer:
         self._meter = StepMeter() if self._is_on_host else DeviceMeter(self.config.run.device)
         self._generator = torch.Generator().manual_seed(self.config.run.seed)
         self._curriculum = WindowCurriculum(self.schedule, self.scene.splits["train"], self.scene.time_range)
-        self.system: System = system_of(self.schedule, self.scene)
+        self.system: ImageSystem | RaySystem = system_of(self.schedule, self.scene)
         self.optimizer = make_optimizer(self.system.parameter_groups(), self.schedule)
 
     def step(self, advance: int = 1) -> StepResult:
@@ -107,7 +113,7 @@ class Trainer:
                 # an outlier would stay in Adam's second moment, and reduce a network's steps, for a thousand steps
                 clip_grad_norm_([p for g in groups if g.is_clipped for p in g.params], clip)
             self.optimizer.step()
-        seen = [(view.frame, view.view) for view in views] if is_accepted else []
+        seen = [(view.frame, view.view) for view in views if view.frame and is_accepted]
         self.system.after_step(self.optimizer, self.reached, seen)
         return self._result()
 
@@ -208,6 +214,12 @@ class Trainer:
         """Factor of all learning rates."""
         return ROLLBACK_LR**self.rollbacks
 
+    @property
+    def images_per_step(self) -> float:
+        """Images that take about as long to evaluate as a step takes."""
+        size = self.config.run.batch_size
+        return size if self._rays is None else RENDERED_PER_STEP * size * self._rays.images_per_batch
+
     def _generators(self) -> list[torch.Generator]:
         return [self._generator, *self.system.generators()]
 
@@ -215,10 +227,7 @@ class Trainer:
         """Render the next batch and differentiate the loss of each image, on a CPU in parallel."""
         size = self.config.run.batch_size
         first = self.optimizer_steps * size
-        drawn = [
-            (self._curriculum.next(number, self.step_count, self._generator), self._next_background(), number)
-            for number in range(first, first + size)
-        ]
+        drawn = [(self._next(number), self._next_background(), number) for number in range(first, first + size)]
         if size == 1 or not self._is_on_host:
             return [self._differentiate(groups, *view) for view in drawn]
         return list(self._workers.map(lambda view: self._differentiate(groups, *view), drawn))
@@ -230,17 +239,28 @@ class Trainer:
 
     @sharing_cores()
     def _differentiate(
-        self, groups: Sequence[ParamGroup], frame: Frame, background: Tensor, number: int
+        self, groups: Sequence[ParamGroup], frame: Frame | RayBatch, background: Tensor, number: int
     ) -> ViewGradients:
-        """Of the image of this number since the start of the run."""
-        run, is_halved = self.config.run, self.schedule.halves(frame.camera.width, self.step_count)
+        """Of the image or batch of this number since the start of the run."""
+        run, moment = self.config.run, self._moment(number)
+        background = to_device(background, run.device)
+        if isinstance(frame, RayBatch):
+            assert isinstance(self.system, RaySystem)
+            target = Target.of_pixels(frame.rgba, background)
+            return differentiate(groups, None, self.system.ray_loss(frame.rays, target, background, moment), target)
+        assert not isinstance(self.system, RaySystem)
+        is_halved = self.schedule.halves(frame.camera.width, self.step_count)
         image = self._training_images.image(frame, is_halved=is_halved)
         frame = frame.halved() if is_halved else frame
-        background = to_device(background, run.device)
         target = Target.over(image, background)
         with trunk_precision("float32" if self._is_on_host else run.gpu_precision):
-            view = self.system.loss(frame, target, background, self._moment(number))
+            view = self.system.loss(frame, target, background, moment)
         return differentiate(groups, frame, view, target)
+
+    def _next(self, number: int) -> Frame | RayBatch:
+        if self._rays is not None:
+            return self._rays.batch(number, self.config.run.seed + ROLLBACK_SEED * self.rollbacks)
+        return self._curriculum.next(number, self.step_count, self._generator)
 
     def _moment(self, number: int) -> Moment:
         seeds = np.random.SeedSequence([self.config.run.seed, self.rollbacks, number])

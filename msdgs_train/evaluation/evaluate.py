@@ -15,7 +15,7 @@ from msdgs_train.engine.run_record import BEST, MODEL, RECORD, Best, RunInvalid,
 from msdgs_train.evaluation.metrics import image_metrics, masked_psnr
 from msdgs_train.evaluation.moving_region import moving_region
 from msdgs_train.evaluation.perceptual import PerceptualMetrics, perceptual_metrics
-from msdgs_train.gaussians.model_file import LoadedModel, load_model
+from msdgs_train.gaussians.stored import StoredModel, load_stored
 from msdgs_train.losses.photometric import filled
 
 FILES = {"last": MODEL, "best": BEST}
@@ -36,7 +36,7 @@ class EvaluatedModel(NamedTuple):
     """One model of a run and its scores."""
 
     name: str  # "last" or "best"
-    loaded: LoadedModel
+    loaded: StoredModel
     images: list[Scores]  # in the order of the split's frames
 
     @property
@@ -62,7 +62,7 @@ class Evaluation(NamedTuple):
     frames: list[Frame]
     models: list[EvaluatedModel]  # last, and best if the run has one
     best: Best | None  # how the best one was selected
-    region_source: str  # "images" or "model": the source of the moving region
+    region_source: str  # "images" or "model": the source of the moving region; "none" if it is unknown
     masks: list[np.ndarray]  # [H, W] bool per frame, the moving region; the same for all models
     unavailable: dict[str, str]  # scores that could not be computed, with the reason
     differing: list[str]  # in what the dataset isn't the one of the run
@@ -85,7 +85,7 @@ def evaluate_run(
     """
     settings = read_config(run).data
     names = [name for name, file in FILES.items() if name == "last" or (not brief and (run / file).exists())]
-    loaded = {name: load_model(run / FILES[name]) for name in names}
+    loaded = {name: load_stored(run / FILES[name]) for name in names}
     data = _data_folder(run, data)
     scene = load_scene(data, settings.size, settings.llffhold, settings.time_from, settings.masks)
     record = read_record(run)
@@ -104,7 +104,10 @@ def evaluate_run(
             if progress is not None:
                 progress(index * len(models) + place + 1, len(frames) * len(models))
     best = record.best if record and "best" in loaded else None
-    return Evaluation(data, split, frames, models, best, region.source, masks, perceptual.unavailable, differing)
+    unavailable = dict(perceptual.unavailable)
+    if region.source == "none":
+        unavailable["moving_psnr"] = "cameras aren't fixed, and what moves in a volume is unknown"
+    return Evaluation(data, split, frames, models, best, region.source, masks, unavailable, differing)
 
 
 def scores(

@@ -7,7 +7,8 @@ The moving region of a frame consists of the pixels that show, at its time, some
 - Otherwise it is determined from the models: the pixels with a channel that changes by more than `MIN_CHANGE` if the
   moving Gaussians are removed. A Gaussian moves, in the view of a frame, if the projections of its center at `TIMES`
   evenly spaced times span more than `MIN_TRAVEL` pixels in width or height; rotation and scaling alone don't count.
-  With several models the region is the union of theirs, so that all are evaluated on the same pixels.
+  With several models the region is the union of theirs, so that all are evaluated on the same pixels. Of volumes it is
+  unknown.
 """
 
 from collections import defaultdict
@@ -23,6 +24,7 @@ from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame, SceneData, composite
 from msdgs_train.gaussians.model import PosedGaussians
 from msdgs_train.gaussians.model_file import LoadedModel
+from msdgs_train.gaussians.stored import StoredModel
 from msdgs_train.rendering.rasterize import rasterize
 
 MIN_CHANGE = 0.1  # as a fraction of the range of a channel
@@ -35,13 +37,13 @@ MEDIAN_IMAGES = 25  # at most, evenly spaced
 class MovingRegion(NamedTuple):
     """The source of the moving region, and a function that gives it for a frame, [H, W] bool."""
 
-    source: Literal["images", "model"]
+    source: Literal["images", "model", "none"]
     mask: Callable[[Frame], np.ndarray]
 
 
-def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -> MovingRegion:
+def moving_region(scene: SceneData, split: str, models: Sequence[StoredModel]) -> MovingRegion:
     """Determine the moving region, from the images if each camera of the split has images at `FIXED_TIMES` or more
-    times in any split, otherwise from the models."""
+    times in any split, otherwise from the models; it is empty if it is unknown."""
     groups: dict[bytes, list[Frame]] = defaultdict(list)
     for frame in (frame for frames in scene.splits.values() for frame in frames):
         groups[_identity(frame.camera)].append(frame)
@@ -52,7 +54,10 @@ def moving_region(scene: SceneData, split: str, models: Sequence[LoadedModel]) -
         return MovingRegion(
             "images", lambda frame: _differs(composite(frame.load_rgba(), background), medians[_identity(frame.camera)])
         )
-    masks = [_model_region(loaded, scene.time_range) for loaded in models]
+    made_of_gaussians = [loaded for loaded in models if isinstance(loaded, LoadedModel)]
+    if len(made_of_gaussians) < len(models):
+        return MovingRegion("none", lambda frame: np.zeros((frame.camera.height, frame.camera.width), bool))
+    masks = [_model_region(loaded, scene.time_range) for loaded in made_of_gaussians]
     return MovingRegion("model", lambda frame: np.any([mask(frame) for mask in masks], 0))
 
 

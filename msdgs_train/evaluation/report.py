@@ -61,7 +61,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 def as_markdown(evaluation: Evaluation) -> str:
     """Return Markdown tables of the means of each model and of its images, with notes."""
     rows = [
-        [m.name, FILES[m.name], f"{m.loaded.step:,}", f"{len(m.loaded.model.gaussians):,}", *cells(evaluation, m.mean)]
+        [m.name, FILES[m.name], f"{m.loaded.step:,}", f"{m.loaded.size:,}", *cells(evaluation, m.mean)]
         for m in evaluation.models
     ]
     parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} images of {evaluation.data}"]
@@ -93,9 +93,13 @@ def cells(evaluation: Evaluation, scores: Scores) -> list[str]:
 
 def notes(evaluation: Evaluation) -> list[str]:
     """Return the lines below the table."""
-    source = {"images": "the images", "model": "the models"}[evaluation.region_source]
-    percent = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
-    lines = [f"moving region: {percent:.1f} % of the pixels, determined from {source}; the same for all models."]
+    lines = []
+    if evaluation.region_source != "none":
+        source = {"images": "the images", "model": "the models"}[evaluation.region_source]
+        percent = 100 * float(np.mean([mask.mean() for mask in evaluation.masks]))
+        lines.append(
+            f"moving region: {percent:.1f} % of the pixels, determined from {source}; the same for all models."
+        )
     if evaluation.differing:
         lines.append(f"data: not as in training; {evaluation.data} differs in {', '.join(evaluation.differing)}.")
     if evaluation.best is not None:
@@ -182,7 +186,7 @@ def _model_as_json(evaluation: Evaluation, evaluated: EvaluatedModel) -> dict[st
     return {
         "file": FILES[evaluated.name],
         "step": evaluated.loaded.step,
-        "gaussians": len(evaluated.loaded.model.gaussians),
+        "gaussians": evaluated.loaded.size,
         "mean": evaluated.mean._asdict(),
         "images": images,
     }

@@ -36,3 +36,4 @@ class ParamGroup(NamedTuple):
     params: list[nn.Parameter]
     lr: LearningRate
     is_clipped: bool = False  # whether their gradients are clipped, all clipped groups of a model together
+    skips_zero: bool = False  # whether entries without a gradient keep their value and their moments

@@ -1,13 +1,14 @@
 """The interface of a system: a model, how it is rendered, and hooks before and after each step."""
 
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame
+from msdgs_train.datasets.rays import Rays
 from msdgs_train.layers.parameters import ParamGroup
 from msdgs_train.systems.targets import Target
 
@@ -20,17 +21,17 @@ class Moment(NamedTuple):
 
 
 class ViewLoss(NamedTuple):
-    """One rendered training image and its loss."""
+    """One rendered training image, or a batch of rays, and its loss."""
 
     loss: Tensor  # scalar
-    rgb: Tensor  # [H, W, 3]
+    rgb: Tensor  # [H, W, 3] or [R, 3]
     clamped_scales: Tensor | int = 0  # Gaussians a scale of which was clamped
     screen: Any = None  # results of the backward pass for `after_step`
     shows_all: bool = False  # nothing of the scene is outside the image
 
 
 class System(Protocol):
-    """The part of training that depends on the kind of model."""
+    """The part of training that depends on the kind of model; an `ImageSystem` or a `RaySystem`."""
 
     @property
     def model(self) -> nn.Module:
@@ -51,14 +52,9 @@ class System(Protocol):
         one: one, unless the schedule follows the clock."""
         ...
 
-    def loss(self, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
-        """Render a frame over `background`, [3], and compare it with its image. Called from several threads at
-        once."""
-        ...
-
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
         """Density control and averaging after these steps of the schedule, counted from 1, of one optimizer step; no
-        views if its loss wasn't finite."""
+        views if its loss wasn't finite, or of rays."""
         ...
 
     def render(self, camera: Camera, t: float, background: Tensor, step: int) -> Tensor:
@@ -79,4 +75,32 @@ class System(Protocol):
 
     def save(self, path: Path, step: int) -> None:
         """Write the model that is evaluated, atomically."""
+        ...
+
+
+class ImageSystem(System, Protocol):
+    """A system that renders an image at a time."""
+
+    def loss(self, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
+        """Render a frame over `background`, [3], and compare it with its image. Called from several threads at
+        once."""
+        ...
+
+
+@runtime_checkable
+class RaySystem(System, Protocol):
+    """A system that renders rays of all images alike."""
+
+    @property
+    def rays_per_batch(self) -> int:
+        """Rays of a batch; a step has as many batches as an `ImageSystem` has images."""
+        ...
+
+    def hits(self, rays: Rays) -> Tensor:
+        """Which rays take part in training, [R] bool."""
+        ...
+
+    def ray_loss(self, rays: Rays, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
+        """Render rays over `background`, [3], and compare them with their pixels. Called from several threads at
+        once."""
         ...

@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from msdgs_serve.rasterizer import RasterizerOptions
 from msdgs_serve.scene import Camera, InvalidInput
-from msdgs_serve.scene.metadata import SceneCamera
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.density.gradient import GradientStrategy
 from msdgs_train.density.mcmc import MCMCStrategy
@@ -18,11 +17,12 @@ from msdgs_train.engine.averaging import WeightAverage
 from msdgs_train.engine.optimizer import restart
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians import model_file
-from msdgs_train.gaussians.bounds import first_by_pose, scene_bounds, scene_scale, spread_frames, views_of
+from msdgs_train.gaussians.bounds import first_by_pose, scene_bounds, scene_scale, views_of
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians, canonical_points
 from msdgs_train.gaussians.scale_space import count_clamped
+from msdgs_train.gaussians.scene_info import SceneInfo
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.parameters import LearningRate, ParamGroup, constant
@@ -32,9 +32,6 @@ from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.supports.base import CanonicalPoints
 from msdgs_train.systems.base import Moment, ViewLoss
 from msdgs_train.systems.targets import Target
-
-VIEWER_CAMERAS, TRAINING_CAMERAS = 20, 32
-"""Cameras that a model file keeps: of the test split, or of training if there is none, and others of training."""
 
 
 class GaussianSplatting:
@@ -180,30 +177,13 @@ class GaussianSplatting:
     @torch.no_grad()
     def save(self, path: Path, step: int) -> None:
         """Write `model.pt`: the model with time range, background, bounds and cameras."""
-        model, info = self.eval_model, self._scene_info(step)
+        model = self.eval_model
+        bounds = scene_bounds(lambda t: self._pose(model, t, step), self.scene.time_range, self.scene_half_size)
+        info = SceneInfo.of_run(self.scene, self.config.data, bounds)
         model_file.save_model(path, model, info, step, self._stored_config(model, step))
 
     def _stored_config(self, model: DynamicGaussians, step: int) -> ModelConfig:
         return replace(model.config, eps2d=self.schedule.eps2d(step))
-
-    def _scene_info(self, step: int) -> model_file.SceneInfo:
-        training = self.scene.splits["train"]
-        shown = spread_frames(self.scene.splits.get("test") or training, VIEWER_CAMERAS)
-        others = first_by_pose([*shown, *spread_frames(training, TRAINING_CAMERAS)], lambda frame: frame.camera)
-        return model_file.SceneInfo(
-            time_range=self.scene.time_range,
-            background=self.config.data.evaluation_background,
-            bounds=scene_bounds(
-                lambda t: self._pose(self.eval_model, t, step), self.scene.time_range, self.scene_half_size
-            ),
-            cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in shown],
-            training_cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in others[len(shown) :]],
-            size=self.config.data.size,
-            llffhold=self.config.data.llffhold,
-            scene_to_world=self.scene.scene_to_world.to_plain(),
-            time_from=self.config.data.time_from,
-            masks=self.config.data.masks,
-        )
 
     def _options(self, step: int) -> RasterizerOptions:
         """Options of the rasterizer in a step, counted from 1."""

@@ -12,7 +12,7 @@ from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.plugins import load_plugins
 from msdgs_train.settings import OWN_SETTINGS
-from msdgs_train.systems.base import System
+from msdgs_train.systems.base import ImageSystem, RaySystem
 
 DEFAULT = "msdgs-nodes"
 
@@ -23,14 +23,17 @@ class SystemEntry(NamedTuple):
     name: str
     description: str  # a line of help
     config: TrainConfig
-    build: Callable[[Schedule, SceneData], System] | None = None  # None: Gaussians
+    build: Callable[[Schedule, SceneData], ImageSystem | RaySystem] | None = None  # None: Gaussians
 
 
 _ENTRIES: dict[str, SystemEntry] = {}
 
 
 def register_system(
-    name: str, description: str, config: TrainConfig, build: Callable[[Schedule, SceneData], System] | None = None
+    name: str,
+    description: str,
+    config: TrainConfig,
+    build: Callable[[Schedule, SceneData], ImageSystem | RaySystem] | None = None,
 ) -> None:
     """Register a system under its name; it may have settings of its own in `config.own`.
 
@@ -52,7 +55,7 @@ def preset(name: str) -> TrainConfig:
     return _entry(name).config
 
 
-def system_of(schedule: Schedule, scene: SceneData) -> System:
+def system_of(schedule: Schedule, scene: SceneData) -> ImageSystem | RaySystem:
     """A new system for a run's settings."""
     build = _entry(schedule.config.run.system).build
     if build is None:

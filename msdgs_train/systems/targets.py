@@ -72,10 +72,10 @@ class TrainingImages:
 
 
 class Target(NamedTuple):
-    """A training image over the background of a step, on the run's device."""
+    """A training image, or pixels of rays, over the background of a step, on the run's device."""
 
-    rgb: Tensor  # [H, W, 3] in [0, 1], over the background
-    alpha: Tensor  # [H, W] uint8
+    rgb: Tensor  # [H, W, 3] or [R, 3] in [0, 1], over the background
+    alpha: Tensor  # [H, W] or [R] uint8
     mask: Tensor | None = None  # [H, W] bool, true where pixels count; None: all do
     facts: ImageFacts = ImageFacts(shows_all=False, is_opaque=False)
 
@@ -89,6 +89,12 @@ class Target(NamedTuple):
             color, alpha = (rgba * (1 / 255)).split((3, 1), dim=2)
             rgb = background + alpha * (color - background)
         return cls(rgb, rgba[..., 3], image.mask, image.facts)
+
+    @classmethod
+    def of_pixels(cls, rgba: Tensor, background: Tensor) -> "Target":
+        """Pixels of rays, [R, 4] uint8 with straight alpha, over a background color, [3]."""
+        color, alpha = (rgba * (1 / 255)).split((3, 1), dim=1)
+        return cls(background + alpha * (color - background), rgba[:, 3])
 
     def alpha_error(self, alpha: Tensor) -> Tensor:
         """Mean absolute difference of a rendering's alpha, [H, W] in [0, 1], over the pixels that count, or 0 if the

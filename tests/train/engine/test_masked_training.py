@@ -153,7 +153,7 @@ def test_the_trainer_gives_masks_to_the_loss_and_to_the_metrics(tmp_path: Path, 
     (evaluated,) = trainer.evaluate("test")
     shown = ~HIDDEN
     assert evaluated.metrics.psnr == pytest.approx(psnr(evaluated.rgb[shown], evaluated.target[shown]))
-    of_frame = trainer.system.loss
+    of_frame = splatting(trainer).loss
 
     def noted(frame: Frame, target: Target, background: torch.Tensor, moment: Moment) -> ViewLoss:
         targets.append(target)

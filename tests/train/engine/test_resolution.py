@@ -12,7 +12,7 @@ from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine import schedule as schedule_module
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.engine.trainer import Trainer
-from tests.support.training_scene import SIZE, small_config
+from tests.support.training_scene import SIZE, small_config, splatting
 
 STEPS = 6
 
@@ -21,7 +21,7 @@ def test_images_are_halved_in_the_first_part(data: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(schedule_module, "HALVED_WIDTH", SIZE)
     trainer = Trainer(small_config(steps=STEPS, half_resolution_fraction=0.5), load_scene(data))
     seen: list[tuple[int, ...]] = []
-    loss = trainer.system.loss
+    loss = splatting(trainer).loss
 
     def noted(frame, target, background, step):
         view = loss(frame, target, background, step)

@@ -22,6 +22,7 @@ from msdgs_train.engine.metrics_log import MetricsLog, read_metrics
 from msdgs_train.engine.run import fit
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation.evaluate import evaluate_run
+from msdgs_train.gaussians import scene_info
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.gaussians.safe_load import CheckpointInvalid
@@ -352,8 +353,8 @@ def test_metrics_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:
 def test_cameras_of_a_model_are_spread_and_kept_once(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(system_module, "VIEWER_CAMERAS", 2)
-    monkeypatch.setattr(system_module, "TRAINING_CAMERAS", 4)
+    monkeypatch.setattr(scene_info, "VIEWER_CAMERAS", 2)
+    monkeypatch.setattr(scene_info, "TRAINING_CAMERAS", 4)
     scene = load_scene(data)
     scene = dataclasses.replace(scene, splits={"train": scene.splits["train"]})
     Trainer(small_config(), scene).system.save(tmp_path / "model.pt", 0)
