@@ -15,7 +15,9 @@ class MaskedAdam(torch.optim.Adam):
         for group in self.param_groups:
             for parameter in group["params"] if group.get("skips_zero") else ():
                 if parameter.grad is not None:
-                    self._step_where_seen(group, parameter, parameter.grad.view(-1))
+                    gradient, broken = parameter.grad.view(-1), getattr(self, "found_inf", None)
+                    gradient = gradient if broken is None else gradient.masked_fill(broken.bool(), 0.0)
+                    self._step_where_seen(group, parameter, gradient)
                     parameter.grad = None
         return super().step(closure)
 

@@ -34,13 +34,13 @@ from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
-from msdgs_train.systems.registry import preset, systems
+from msdgs_train.systems.registry import preset
 from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model, saved
 from tests.support.processes import ROOT
 from tests.support.service import serving
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import shrunk, write_scene
+from tests.support.training_scene import GAUSSIANS, shrunk, write_scene
 
 pytestmark = pytest.mark.slow
 
@@ -145,7 +145,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_scene(tmp_path_factory.mktemp("data") / "scene")
 
 
-@pytest.mark.parametrize("name", systems())
+@pytest.mark.parametrize("name", GAUSSIANS)
 def test_each_preset_exports(name: str, data: Path, tmp_path: Path):
     trainer = Trainer(shrunk(preset(name)), load_scene(data))
     for _ in range(12):

@@ -31,10 +31,14 @@ from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
+from msdgs_train.systems.registry import systems
+from msdgs_train.volumes.config import VolumeConfig
 from tests.support.scenes import gaussians_of
 
 SIZE = 24
 FOV = 40.0
+GAUSSIANS = [name for name, entry in systems().items() if not isinstance(entry.config.own, VolumeConfig)]
+"""Systems that are made of Gaussians."""
 FEW = ["--threads=1", "--init-num-pts=60", "--max-gaussians=90"]
 """Options of a small run on the command line."""
 

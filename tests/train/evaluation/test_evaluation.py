@@ -32,7 +32,7 @@ from msdgs_train.evaluation.moving_region import moving_region, travels
 from msdgs_train.evaluation.perceptual import perceptual_metrics
 from msdgs_train.evaluation.sheets import CAPTION, HEADER
 from msdgs_train.gaussians.model import PosedGaussians
-from msdgs_train.gaussians.model_file import load_model
+from msdgs_train.gaussians.model_file import LoadedModel, load_model
 from tests.support.scenes import front_camera, gaussians_of
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import SIZE, small_config, write_scene
@@ -191,7 +191,7 @@ class _Moving:
 
 def test_the_models_region_is_where_gaussians_that_move_are_seen() -> None:
     camera, white = front_camera(), (1.0, 1.0, 1.0)
-    loaded = types.SimpleNamespace(model=_Moving(), scene=types.SimpleNamespace(background=white))
+    loaded = LoadedModel(_Moving(), types.SimpleNamespace(background=white), 0)  # type: ignore[arg-type]
     frames = [Frame(str(t), camera, t, Path("none")) for t in (0.0, 1.0)]
     scene = types.SimpleNamespace(splits={"train": [], "test": frames}, time_range=(0.0, 1.0))
     region = moving_region(scene, "test", [loaded])  # type: ignore[arg-type]

@@ -1,0 +1,77 @@
+"""Marching of rays through a volume: samples, their weights, and the color of each ray.
+
+A sample of density σ over a length δ has the optical depth σ δ and the opacity 1 - exp(-σ δ); it is seen through the
+sum of the optical depths before it.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from msdgs_train.datasets.rays import Rays
+
+if TYPE_CHECKING:
+    from msdgs_train.volumes.field import RayField
+
+
+class Samples(NamedTuple):
+    """Points on rays, ray by ray, from near to far."""
+
+    points: Tensor  # [M, 3] scene units
+    rays: Tensor  # [M] int64, the ray of each
+    steps: Tensor  # [M] int64, its number on the ray
+    lengths: Tensor  # [M] that it stands for
+
+    @classmethod
+    def of(cls, points: Tensor, lengths: Tensor, inside: Tensor) -> "Samples":
+        """Those of `points`, [R, S, 3], that are `inside`, [R, S] bool; `lengths`, [S], are the same for all rays."""
+        rays, steps = torch.nonzero(inside, as_tuple=True)
+        return cls(points[rays, steps], rays, steps, lengths[steps])
+
+    def where(self, chosen: Tensor) -> "Samples":
+        """Those that `chosen`, [M] bool, names."""
+        return Samples(*(tensor[chosen] for tensor in self))
+
+
+class Marched(NamedTuple):
+    """Colors of rays, and the samples that they are made of."""
+
+    rgb: Tensor  # [R, 3]
+    left: Tensor  # [R] part of the background that is seen
+    weights: Tensor  # [M], those of samples whose color counts
+    colors: Tensor  # [M, 3]
+    rays: Tensor  # [M] int64
+
+
+def weigh(depths: Tensor, samples: Samples, rays: int, stop: float) -> tuple[Tensor, Tensor]:
+    """Weights of samples, [M], and what is left of the background, [R].
+
+    Args:
+        depths: optical depths, [M].
+        stop: nothing is seen behind samples that leave less than this.
+    """
+    steps = int(samples.steps.max()) + 1 if len(samples.steps) else 1
+    place = samples.rays * steps + samples.steps
+    dense = depths.new_zeros(rays * steps).index_put((place,), depths).view(rays, steps)
+    before = dense.cumsum(dim=1) - dense
+    if stop:
+        dense = torch.where(torch.exp(-before) >= stop, dense, 0.0)
+    weights = torch.exp(-before) * -torch.expm1(-dense)
+    return weights.view(-1)[place], torch.exp(-dense.sum(dim=1))
+
+
+def march(field: "RayField", rays: Rays, background: Tensor, generator: torch.Generator | None = None) -> Marched:
+    """Colors of rays over `background`, [3]; with a generator, samples are shifted as in training."""
+    samples = field.samples(rays, generator)
+    depths, features = field.optical_depths(samples, rays)
+    if field.least_depth:
+        kept = depths > field.least_depth
+        samples, depths, features = samples.where(kept), depths[kept], features[kept]
+    weights, left = weigh(depths, samples, len(rays.times), field.stop)
+    seen = weights > field.least_weight
+    samples, weights = samples.where(seen), weights[seen]
+    colors = field.colors(samples, rays, features[seen])
+    rgb = left[:, None] * background
+    rgb = rgb.index_add(0, samples.rays, weights[:, None] * colors)
+    return Marched(rgb, left, weights, colors, samples.rays)

@@ -1,0 +1,108 @@
+"""Training of a volume on batches of rays; implements `RaySystem`."""
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from msdgs_serve.scene import Camera
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.datasets import Frame, SceneData
+from msdgs_train.datasets.rays import Rays
+from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.optimizer import restart
+from msdgs_train.engine.schedule import Schedule
+from msdgs_train.gaussians.config import ModelConfig
+from msdgs_train.gaussians.scene_info import SceneInfo
+from msdgs_train.layers.parameters import ParamGroup
+from msdgs_train.systems.base import Moment, ViewLoss
+from msdgs_train.systems.targets import Target
+from msdgs_train.volumes.config import VolumeConfig
+from msdgs_train.volumes.march import march
+from msdgs_train.volumes.model_file import render, save_volume
+
+BASE = TrainConfig().updated(
+    model=ModelConfig(layers=(), embedding_dim=0),
+    static_fraction=0.0,
+    window_full_fraction=0.0,
+    adam_beta2=0.99,
+    adam_eps=1e-8,
+)
+"""Settings that all volumes share: all images take part from the start."""
+UNUSED = ("curriculum", "loss", "poses", "model")
+"""Groups of settings of Gaussians; those of density control are ignored, since comparisons set them for all systems."""
+
+
+class VolumeSystem:
+    """A volume whose grids grow during the run."""
+
+    def __init__(self, schedule: Schedule, scene: SceneData) -> None:
+        config = schedule.config
+        assert isinstance(config.own, VolumeConfig)
+        _refuse_unused(config)
+        self.schedule, self.config, self.scene, self.settings = schedule, config, scene, config.own
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.run.seed)
+            self.model = self.settings.build(self.settings.box_of(scene)).to(config.run.device)
+        self._step = 0
+
+    @property
+    def size(self) -> int:
+        return self.model.size
+
+    @property
+    def rays_per_batch(self) -> int:
+        return self.settings.rays
+
+    @torch.no_grad()
+    def hits(self, rays: Rays) -> Tensor:
+        return self.model.hits(rays)
+
+    def parameter_groups(self) -> list[ParamGroup]:
+        return self.model.parameter_groups(self._step / self.schedule.num_steps)
+
+    def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
+        before, self._step = list(self.model.parameters()), steps.stop - 1
+        for at, change in self.model.changes():
+            if round(at * self.schedule.num_steps) in steps:
+                change()
+        if any(now is not then for now, then in zip(self.model.parameters(), before, strict=True)):
+            restart(optimizer, self.parameter_groups())
+
+    def ray_loss(self, rays: Rays, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
+        marched = march(self.model, rays, background, moment.generator)
+        error = (marched.rgb - target.rgb).square().mean()
+        regularizers = self.model.regularizers(marched, target.rgb, moment.step / self.schedule.num_steps)
+        return ViewLoss(error + regularizers, marched.rgb)
+
+    def after_step(
+        self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]
+    ) -> None: ...
+
+    def render(self, camera: Camera, t: float, background: Tensor, step: int) -> Tensor:
+        return render(self.model, camera, t, background)
+
+    def generators(self) -> list[torch.Generator]:
+        return []
+
+    def state(self) -> dict[str, Any]:
+        return {"model": self.model.state_dict()}
+
+    def load_state(self, state: dict[str, Any], step: int) -> None:
+        self.model.load_grown(state["model"])
+        self._step = step
+
+    def save(self, path: Path, step: int) -> None:
+        info = SceneInfo.of_run(self.scene, self.config.data, self.model.corners.tolist())
+        save_volume(path, self.config.run.system, self.model, self.settings, info, step)
+
+
+def _refuse_unused(config: TrainConfig) -> None:
+    for group in UNUSED:
+        wanted, base = getattr(config, group), getattr(BASE, group)
+        for item in fields(base):
+            if getattr(wanted, item.name) != getattr(base, item.name):
+                problem = f"not given: {config.run.system} has no Gaussians"
+                raise InvalidInput(f"config.{item.name}", problem, getattr(wanted, item.name))
