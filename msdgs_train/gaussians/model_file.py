@@ -42,7 +42,8 @@ class LoadedModel(NamedTuple):
         modulation = self.model.modulation
         own = 0 if modulation is None else sum(p.numel() for p in modulation.parameters())
         embeddings = 0 if modulation is None else self.model.gaussians.attributes[EMBEDDINGS].numel()
-        return ParameterCounts(sum(p.numel() for p in self.model.deformation.parameters()), own + embeddings)
+        layers = (*self.model.deformation.parameters(), *self.model.support.parameters())
+        return ParameterCounts(sum(p.numel() for p in layers), own + embeddings)
 
     @torch.no_grad()
     def render(self, camera: Camera, t: float, num_layers: int | None = None) -> Tensor:

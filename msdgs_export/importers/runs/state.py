@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.guard import read_guarded
-from msdgs_train.gaussians.model_file import CheckpointInvalid, load, refuse_unlike_stored
+from msdgs_train.gaussians.safe_load import CheckpointInvalid, load, refuse_unlike_stored
 
 PICKLE_BYTES = 1 << 24
 """Of the part of a torch file with its names, which is searched."""
