@@ -28,6 +28,7 @@ from msdgs_serve import __version__
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -153,11 +154,24 @@ def test_each_preset_exports(name: str, data: Path, tmp_path: Path):
     trainer.system.save(tmp_path / "model.pt", 12)
     exported = export_scene(tmp_path / "model.pt", tmp_path / "scene.onnx", times=5)
     drawn = DeformationSession(exported.path).gaussians(0.37)
+    model = load_model(tmp_path / "model.pt").model
     with torch.no_grad():  # unit quaternions for those that are raw in training
-        posed = load_model(tmp_path / "model.pt").model.pose(0.37)
-    for field in ("means", "quats", "scales"):
-        want = getattr(posed, field).numpy()
-        np.testing.assert_allclose(getattr(drawn, field), want, rtol=0, atol=tolerance("export.relative"))
+        posed = model.pose(0.37)
+    expected = {name: getattr(posed, name).detach().numpy() for name in ("means", "quats", "scales")}
+    atol = tolerance("export.relative")
+    np.testing.assert_allclose(drawn.means, expected["means"], rtol=0, atol=atol)
+    if model.config.quat_space == "raw":  # axes of equal length have no direction
+        shapes = covariances(expected["quats"], expected["scales"])
+        np.testing.assert_allclose(covariances(drawn.quats, drawn.scales), shapes, rtol=0, atol=atol * shapes.max())
+    else:
+        np.testing.assert_allclose(drawn.quats, expected["quats"], rtol=0, atol=atol)
+        np.testing.assert_allclose(drawn.scales, expected["scales"], rtol=0, atol=atol)
+
+
+def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """[N, 3, 3] of N Gaussians."""
+    axes = to_matrix(quats.astype(np.float64)) * scales[:, None, :]
+    return axes @ axes.transpose(0, 2, 1)
 
 
 def test_images_are_as_wide_as_those_of_the_run(data: Path):

@@ -160,7 +160,7 @@ def test_motion_is_offered_only_where_there_is_some(page: Page, client: httpx.Cl
 
 def test_a_view_that_does_not_exist_is_named(page: Page, client: httpx.Client):
     open_page(page, client, "#scene=balls&view=velocity")
-    expect(page.locator("#notice")).to_contain_text("doesn’t exist")
+    expect(page.locator("#notice")).to_contain_text("a view that this page doesn’t have")
 
 
 @pytest.mark.parametrize("width", [1280, 390])

@@ -129,7 +129,6 @@ WRONG = [
     (POSES, lambda poses: poses[:, :15], "file", "must hold real numbers in shape M×17"),
     (POSES, lambda poses: poses.astype(str), "file", "must hold real numbers in shape M×17"),
     (POSES, lambda poses: poses[:1], "rows", "are 1, but there are 2 cameras: cam00 cam01"),
-    (POSES, lambda poses: np.tile(poses, (2, 1)), "rows", "are 4, but there are 2 cameras"),
     (POSES, put(math.nan, (1, 3)), "row 1", "must be finite"),
     (POSES, put(math.inf, (0, 16)), "row 0", "must be finite"),
     (POSES, put(-1.0, (1, 15)), "row 1", "must end in 0 < near < far, got -1 and 9"),
