@@ -48,7 +48,7 @@ class FixedView:
 @dataclass
 class _Entry:
     lock: threading.Lock = field(default_factory=threading.Lock)
-    sequence: FrameSequence | None = None  # None: this camera has been seen once
+    sequence: FrameSequence | None = None  # None: not made yet, or not kept
     is_too_large: bool = False  # for the memory of the cache
 
 
@@ -100,6 +100,7 @@ class SequenceCache:
                 self._evict()
             return sequence.frame(_rows(gaussians, slice(moving)))
         except TooManyPairs:
+            entry.is_too_large = entry.sequence is None
             return None
         finally:
             entry.lock.release()
@@ -112,7 +113,7 @@ class SequenceCache:
                 self._entries[key] = _Entry()
             self._entries.move_to_end(key)
             once = [each for each, kept in self._entries.items() if kept.sequence is None]
-            for each in once[: len(once) - REMEMBERED_CAMERAS]:
+            for each in once[: max(len(once) - REMEMBERED_CAMERAS, 0)]:
                 del self._entries[each]
             return entry
 

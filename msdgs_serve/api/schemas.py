@@ -171,7 +171,8 @@ class RenderRequest(Strict):
         default=None,
         description="x, y, width and height of the part of the image to render, in pixels from its upper left corner; "
         "default: all. Its pixels are exactly those of the whole image, and only they count for limits. `exr` stores "
-        "it as the data window. In 8-bit formats `depth` needs `depth_range`",
+        "it as the data window. In 8-bit formats `depth` needs `depth_range`; `motion` and `gaussians` need `exr` or "
+        "`npy`",
         examples=[[256, 0, 128, 128]],
     )
     format: ImageFormat = Field(

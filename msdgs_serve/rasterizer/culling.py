@@ -6,15 +6,23 @@ import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.view import FISHEYE, ORTHOGRAPHIC, View
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.static_bounds import BLOCK, StaticBounds
 
 MARGIN = 1.0
 """Pixels added to the reach of a block, for what the projection rounds."""
+STRETCH = 1.01
+"""Factor of the reach: quaternions and cameras that are valid may lengthen axes by a factor of 1.0053."""
+LARGEST_EXTENT = 1e15
+"""Pixels. Blocks of larger splats are always read: their extents may overflow in the projection."""
 
 
 def seen_blocks(bounds: StaticBounds, view: View, count: int) -> np.ndarray:
     """Return which blocks of `count` Gaussians may be seen, [ceil(count / BLOCK)] uint8."""
     seen = np.ones(-(-count // BLOCK), np.uint8)
+    if len(bounds.sizes) != max(len(seen) - bounds.first, 0):
+        expected = f"bounds of the Gaussians that are drawn, {len(seen)} blocks of {BLOCK} with those that move"
+        raise InvalidInput("static", expected, f"{bounds.first + len(bounds.sizes)} blocks")
     if view.model != FISHEYE:
         _test_boxes(bounds.boxes, bounds.sizes, view, seen[bounds.first :])
     return seen
@@ -39,13 +47,15 @@ def _test_boxes(boxes: np.ndarray, sizes: np.ndarray, view: View, seen: np.ndarr
         y = r[1, 0] * box[0] + r[1, 1] * box[1] + r[1, 2] * box[2] + t[1]
         z = r[2, 0] * box[0] + r[2, 1] * box[1] + r[2, 2] * box[2] + t[2]
         depth = _half_width(r, 0.0, 0.0, 1.0, box)
-        if z + depth <= view.near_plane:
+        if z + depth <= 0.999 * view.near_plane:
             seen[k] = 0
             continue
         scale = 1.0 if view.model == ORTHOGRAPHIC else 1 / max(z - depth, view.near_plane)
         size = sizes[k] * scale
-        extent_x = 1.001 * math.sqrt(reach * ((stretch_x * size) ** 2 + view.eps2d)) + MARGIN
-        extent_y = 1.001 * math.sqrt(reach * ((stretch_y * size) ** 2 + view.eps2d)) + MARGIN
+        extent_x = STRETCH * math.sqrt(reach * ((stretch_x * size) ** 2 + view.eps2d)) + MARGIN
+        extent_y = STRETCH * math.sqrt(reach * ((stretch_y * size) ** 2 + view.eps2d)) + MARGIN
+        if not max(extent_x, extent_y) < LARGEST_EXTENT:
+            continue
         sides = (
             (view.fx, 0.0, view.cx + extent_x - view.left),
             (-view.fx, 0.0, view.right + extent_x - view.cx),

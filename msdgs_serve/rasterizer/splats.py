@@ -20,8 +20,8 @@ CACHE_LINE_BYTES = 64
 
 
 class Splats(NamedTuple):
-    """N projected Gaussians. One that isn't drawn has a record of zeros and an empty rectangle, or none at all if it
-    was left out with its block.
+    """N projected Gaussians. One that isn't drawn has a record of zeros, or none at all if it was left out with its
+    block, and any rectangle.
 
     A record holds the mean X, Y in pixels; the root [[A, B], [0, C]] of the inverse 2D covariance times `ROOT_SCALE`²,
     in 1/px; log2 of the opacity; the color seen from the camera, at least 0; the depth along the camera's axis in scene

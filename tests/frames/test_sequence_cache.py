@@ -4,12 +4,15 @@ import gc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from msdgs_serve import sequence_cache
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.imaging import Image
+from msdgs_serve.rasterizer import TooManyPairs
 from msdgs_serve.renderer import Renderer, RenderOptions, Shutter
 from msdgs_serve.scene import Camera, InvalidInput, Region
 from tests.support.scene_files import level_camera, write_scene
@@ -124,3 +127,30 @@ def test_threads_get_their_own_frames(session: DeformationSession):
         frames = list(pool.map(lambda t: renderer.render(session, camera, t), asked))
     for t, image in zip(asked, frames, strict=True):
         assert_same(image, expected[t])
+
+
+def test_cameras_are_remembered_up_to_a_number(session: DeformationSession, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sequence_cache, "REMEMBERED_CAMERAS", 4)
+    renderer, camera = Renderer(), level_camera(16)
+    cameras = [replace(camera, cx=camera.cx + k) for k in range(5)]
+    for count, drawn in ((3, 3), (5, 0)):
+        renderer = Renderer()
+        for t in TIMES[:2]:
+            for one in cameras[:count]:
+                renderer.render(session, one, t)
+        assert renderer.sequences.use.drawn == drawn
+
+
+def test_what_can_only_be_drawn_in_parts_is_tried_once(session: DeformationSession, monkeypatch: pytest.MonkeyPatch):
+    tried = []
+
+    def too_many(*_: Any, **__: Any) -> None:
+        tried.append(1)
+        raise TooManyPairs
+
+    monkeypatch.setattr(sequence_cache, "FrameSequence", too_many)
+    monkeypatch.setattr(sequence_cache, "_least_bytes", lambda *_: 0)
+    renderer, camera = Renderer(), level_camera(16)
+    for t in TIMES:
+        assert_same(renderer.render(session, camera, t), Renderer(sequence_bytes=0).render(session, camera, t))
+    assert len(tried) == 1

@@ -10,7 +10,7 @@ from msdgs_serve.rasterizer import GSPLAT, INRIA, RasterizerOptions, rasterize
 from msdgs_serve.rasterizer.culling import seen_blocks
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.view import view_of
-from msdgs_serve.scene import Camera, Gaussians, Region
+from msdgs_serve.scene import Camera, Gaussians, InvalidInput, Region
 from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.static_bounds import BLOCK, static_bounds
 from tests.support.scenes import as_dtype, random_scene, select, unit_quats
@@ -57,7 +57,33 @@ def test_few_blocks_hold_all_that_is_drawn():
         drawn = np.unique((keys & np.uint64(0xFFFFFFFF)) // np.uint64(BLOCK))
         seen = seen_blocks(static, view_of(view, GSPLAT), len(gaussians))
         assert seen[drawn].all()
-        rasterize(gaussians, view.resized(20, 16), static=static)
+        culled = project(gaussians, view, GSPLAT, static=static)
+        assert culled.visible == splats.visible
+
+
+@pytest.mark.parametrize(
+    ("mean", "quat", "scales"),
+    [
+        ((-5.042, 0.0, 1.0), (0.0, 0.0, 1.0009, 0.0), (1.5, 1.5, 1.5)),
+        ((-1e21, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (1e20, 1e-2, 1e-2)),
+        ((0.0, 0.0, 0.01000001), (1.0, 0.0, 0.0, 0.0), (1e-4, 1e-4, 1e-4)),
+    ],
+    ids=["a quaternion of length 1.0009", "an extent that overflows", "at the near plane"],
+)
+def test_extreme_gaussians_are_left_out_only_if_they_are_not_drawn(mean: tuple, quat: tuple, scales: tuple):
+    arrays = (mean, quat, scales, 1.0, np.ones((1, 3)))
+    gaussians = Gaussians(*(np.array([each], np.float32) for each in arrays))
+    camera = Camera(1000.0, 1000.0, 32.0, 32.0, 64, 64, np.eye(4))
+    static = static_bounds(0, gaussians.means, gaussians.scales)
+    whole = rasterize(gaussians, camera)
+    np.testing.assert_array_equal(rasterize(gaussians, camera, static=static).rgb, whole.rgb)
+
+
+def test_bounds_of_other_gaussians_are_refused():
+    gaussians, camera = in_order(2_000, np.float32)
+    static = static_bounds(0, gaussians.means, gaussians.scales)
+    with pytest.raises(InvalidInput, match="static"):
+        rasterize(select(gaussians, slice(300)), camera, static=static)
 
 
 def test_a_scene_without_static_gaussians_has_no_blocks():
