@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets.rays import Rays
 from msdgs_train.layers.parameters import ParamGroup
-from msdgs_train.volumes.march import Marched, Samples
+from msdgs_train.volumes.samples import Marched, Samples
 from msdgs_train.volumes.space import Box
 
 Change = tuple[float, Callable[[], None]]

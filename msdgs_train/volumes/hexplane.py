@@ -20,7 +20,7 @@ from msdgs_train.datasets.rays import Rays
 from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.volumes.config import VolumeConfig
 from msdgs_train.volumes.field import Change, RayField, encoded
-from msdgs_train.volumes.march import Marched, Samples
+from msdgs_train.volumes.samples import Marched, Samples
 from msdgs_train.volumes.space import Box, in_occupied, occupied_cells
 
 AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # two of a plane in space, and that of its plane over time

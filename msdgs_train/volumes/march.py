@@ -4,44 +4,12 @@ A sample of density σ over a length δ has the optical depth σ δ and the opac
 sum of the optical depths before it.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
-
 import torch
 from torch import Tensor
 
 from msdgs_train.datasets.rays import Rays
-
-if TYPE_CHECKING:
-    from msdgs_train.volumes.field import RayField
-
-
-class Samples(NamedTuple):
-    """Points on rays, ray by ray, from near to far."""
-
-    points: Tensor  # [M, 3] scene units
-    rays: Tensor  # [M] int64, the ray of each
-    steps: Tensor  # [M] int64, its number on the ray
-    lengths: Tensor  # [M] that it stands for
-
-    @classmethod
-    def of(cls, points: Tensor, lengths: Tensor, inside: Tensor) -> "Samples":
-        """Those of `points`, [R, S, 3], that are `inside`, [R, S] bool; `lengths`, [S], are the same for all rays."""
-        rays, steps = torch.nonzero(inside, as_tuple=True)
-        return cls(points[rays, steps], rays, steps, lengths[steps])
-
-    def where(self, chosen: Tensor) -> "Samples":
-        """Those that `chosen`, [M] bool, names."""
-        return Samples(*(tensor[chosen] for tensor in self))
-
-
-class Marched(NamedTuple):
-    """Colors of rays, and the samples that they are made of."""
-
-    rgb: Tensor  # [R, 3]
-    left: Tensor  # [R] part of the background that is seen
-    weights: Tensor  # [M], those of samples whose color counts
-    colors: Tensor  # [M, 3]
-    rays: Tensor  # [M] int64
+from msdgs_train.volumes.field import RayField
+from msdgs_train.volumes.samples import Marched, Samples
 
 
 def weigh(depths: Tensor, samples: Samples, rays: int, stop: float) -> tuple[Tensor, Tensor]:
@@ -61,7 +29,7 @@ def weigh(depths: Tensor, samples: Samples, rays: int, stop: float) -> tuple[Ten
     return weights.view(-1)[place], torch.exp(-dense.sum(dim=1))
 
 
-def march(field: "RayField", rays: Rays, background: Tensor, generator: torch.Generator | None = None) -> Marched:
+def march(field: RayField, rays: Rays, background: Tensor, generator: torch.Generator | None = None) -> Marched:
     """Colors of rays over `background`, [3]; with a generator, samples are shifted as in training."""
     samples = field.samples(rays, generator)
     depths, features = field.optical_depths(samples, rays)

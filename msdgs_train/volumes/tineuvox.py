@@ -19,7 +19,7 @@ from msdgs_train.datasets.rays import Rays, rays_of
 from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.volumes.config import VolumeConfig
 from msdgs_train.volumes.field import Change, RayField, encoded
-from msdgs_train.volumes.march import Marched, Samples
+from msdgs_train.volumes.samples import Marched, Samples
 from msdgs_train.volumes.space import Box
 
 POSITION, VIEW, TIME, FEATURE = 10, 4, 8, 2  # frequencies

@@ -14,7 +14,8 @@ from msdgs_train.datasets import rays as rays_module
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.datasets.rays import RayBatches, Rays, rays_of
 from msdgs_train.systems.targets import Target, TrainingImage
-from msdgs_train.volumes.march import Samples, weigh
+from msdgs_train.volumes.march import weigh
+from msdgs_train.volumes.samples import Samples
 from msdgs_train.volumes.space import Box, in_occupied, occupied_cells
 from tests.support.tolerances import assert_close
 from tests.support.training_scene import SIZE
