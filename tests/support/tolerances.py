@@ -72,6 +72,7 @@ TABLE = (
     Row("oracle_db", 70.0, "whole image, threshold pixels included: one step in 1 of 5,000 at every pixel"),
     Row("motion_vector", 2e-3, "pixels; a displacement of 30, stored and blended in float32, over a sum of weights"),
     Row("stress.growth", 61.0, "MiB that 16 threads keep; a frame lost each time would be gigabytes"),
+    Row("capture.turn", 0.5, "degrees between neighbours: two of the 224 pixels that show some 50 degrees"),
     Row("kernel_coverage", 95.0, "per cent of the kernels' lines; what is left needs the compiler"),
     Row("cuda.pixel", 1e-3, "7e-4 where a splat's alpha is at the threshold in one of them; 3e-7 in the mean"),
     Row("cuda.psnr", 3.0, "dB; the same images in the same order, but no two runs of a few steps are alike"),

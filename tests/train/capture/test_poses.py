@@ -21,6 +21,7 @@ from msdgs_train.capture.moving import find_moving
 from msdgs_train.capture.poses import Poses, find_poses
 from msdgs_train.datasets import SceneData, load_scene
 from tests.support.clips import Clip, fixed_camera_clips
+from tests.support.tolerances import tolerance
 from tests.support.training_scene import small_config, splatting, trained
 from tests.train.capture.conftest import COUNT, Captured
 
@@ -38,12 +39,10 @@ def worst_turn(captured: Captured, poses: Poses) -> float:
     return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))).max())
 
 
-def test_matches_on_what_moves_would_make_the_poses_worse(captured: Captured, tmp_path: Path):
+def test_all_frames_have_poses_near_the_true_ones(captured: Captured):
     poses = Poses.load(captured.step("poses"), captured.frames)
-    others = find_poses(captured.images, captured.frames, tmp_path, threads=1, all_matches=True)
     assert len(poses.registered) == len(captured.frames.frames) == COUNT
-    assert poses.summary.error < others.summary.error
-    assert worst_turn(captured, poses) < worst_turn(captured, others)
+    assert worst_turn(captured, poses) < tolerance("capture.turn")
 
 
 def test_most_of_what_is_masked_moves_and_most_of_what_moves_is_masked(captured: Captured):
