@@ -137,6 +137,28 @@ def test_frames_of_a_fixed_camera_share_its_pose(rig: tuple[list[Clip], Path, Fr
         assert (own == own[0]).all()
 
 
+def test_fixed_cameras_of_one_lens_share_its_intrinsics(rig: tuple[list[Clip], Path, FrameSet, Poses]):
+    _, _, _, poses = rig
+    assert (poses.summary.intrinsics == poses.summary.intrinsics[0]).all()
+
+
+def test_fixed_cameras_of_two_lenses_keep_their_own(rig: tuple[list[Clip], Path, FrameSet, Poses], tmp_path: Path):
+    _, images, frames, _ = rig
+    for frame in frames.frames:
+        image = read_color(images / frame.name)
+        if frame.camera % 2:
+            height, width = image.shape[:2]
+            inner = image[height // 16 : -height // 16, width // 16 : -width // 16]
+            image = cv2.resize(inner, (width, height), interpolation=cv2.INTER_CUBIC)
+        write_image(tmp_path / frame.name, image)
+    poses = find_poses(tmp_path, frames, tmp_path / "poses", threads=1)
+    cameras = {frame.name: frame.camera for frame in frames.frames}
+    focals = dict(zip((cameras[name] for name in poses.registered), poses.summary.intrinsics[:, 0], strict=True))
+    wide, narrow = ([focal for camera, focal in focals.items() if camera % 2 == odd] for odd in (0, 1))
+    assert len(wide) + len(narrow) >= 3
+    assert np.mean(narrow) > 1.05 * np.mean(wide)
+
+
 def test_fixed_cameras_mask_what_differs_from_their_background(
     rig: tuple[list[Clip], Path, FrameSet, Poses], tmp_path: Path
 ):

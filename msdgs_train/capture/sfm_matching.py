@@ -1,0 +1,83 @@
+"""SIFT features of a capture's views, and their matches. Part of the process of `sfm_process`."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import pycolmap
+
+from msdgs_train.capture.sfm_process import PosesJob
+from msdgs_train.capture.sfm_report import report
+
+T = TypeVar("T")
+
+CAMERA_MODEL = "SIMPLE_RADIAL"
+BACKGROUND_PEAK = 0.002
+"""Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is
+but one view of each camera."""
+BATCH = 16
+"""Images, or hundreds of pairs, between two reports of progress."""
+TOLERANCE = 1 / 700
+"""Pixels of error, per pixel of the long side, that a match and a point may have; at least one. COLMAP's are four
+pixels, which in a small image is the motion of an object between two frames."""
+
+
+def extract(job: PosesJob, database: Path) -> None:
+    """Write the cameras and SIFT features of all views."""
+    total, done = sum(len(camera.names) for camera in job.cameras), 0
+    for camera in job.cameras:
+        options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
+        reader = pycolmap.ImageReaderOptions(camera_model=CAMERA_MODEL)
+        if camera.frames is not None:
+            options.sift.peak_threshold = BACKGROUND_PEAK
+        for names in _batches(camera.names, BATCH):
+            report("features", done, total)
+            mode = pycolmap.CameraMode.SINGLE
+            pycolmap.extract_features(database, Path(camera.folder), list(names), mode, reader, options)
+            if reader.existing_camera_id < 0:
+                reader.existing_camera_id = _camera_of(database, names[0])
+            done += len(names)
+    report("features", total, total)
+
+
+def match(job: PosesJob, database: Path) -> None:
+    """Match the pairs and write their two-view geometries."""
+    options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
+    options.guided_matching = only_fixed(job)
+    geometry = geometry_options(job, database)
+    chosen = Path(job.workspace) / "pairs.txt"
+    done = 0
+    for pairs in _batches(job.pairs, 100):
+        report("matching", done, len(job.pairs))
+        chosen.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=chosen)
+        pycolmap.match_image_pairs(database, options, pairing, geometry)
+        done += len(pairs)
+    chosen.unlink(missing_ok=True)
+    report("matching", done, done)
+
+
+def geometry_options(job: PosesJob, database: Path) -> pycolmap.TwoViewGeometryOptions:
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed = job.seed
+    options.ransac.max_error = tolerance_of(database)
+    return options
+
+
+def tolerance_of(database: Path) -> float:
+    with pycolmap.Database.open(database) as opened:
+        return max(1.0, TOLERANCE * max(max(camera.width, camera.height) for camera in opened.read_all_cameras()))
+
+
+def only_fixed(job: PosesJob) -> bool:
+    return all(camera.frames is not None for camera in job.cameras)
+
+
+def _camera_of(database: Path, name: str) -> int:
+    with pycolmap.Database.open(database) as opened:
+        image = opened.read_image_with_name(name)
+    return image.camera_id if image is not None else -1
+
+
+def _batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
+    return (items[first : first + size] for first in range(0, len(items), size))
