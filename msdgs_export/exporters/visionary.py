@@ -13,7 +13,7 @@ from onnx import NodeProto, TensorProto, helper, numpy_helper
 
 from msdgs_export.importers.splats.base import as_float32
 from msdgs_export.layers.graph import GraphBuilder
-from msdgs_export.supports.nodes import quaternion_products
+from msdgs_export.layers.rotations import quaternion_products
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import BakedScene
 from msdgs_serve.scene.errors import InvalidInput

@@ -4,6 +4,7 @@ A kind from outside this package registers itself with `LAYERS[kind] = export`, 
 """
 
 from msdgs_export.layers.base import HEAD_COLUMNS, HEADS, LayerExport, LayerInputs, ModelNotExportable
+from msdgs_export.layers.bodies import BodiesExport
 from msdgs_export.layers.hash4d import Hash4DExport
 from msdgs_export.layers.mlp import MLPExport
 from msdgs_export.layers.plane import PlaneExport
@@ -17,6 +18,7 @@ LAYERS: dict[str, LayerExport] = {
     "plane": PlaneExport(),
     "spline": SplineExport(),
     "hash4d": Hash4DExport(),
+    "bodies": BodiesExport(),
 }
 """By the attribute `kind` of a layer."""
 

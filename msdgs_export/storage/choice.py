@@ -44,6 +44,7 @@ GROUPS = {
     "sh": Group(r"((static|canonical)_)?sh", _bits(in_range, 8, 16)),
     "modulation": Group(r"\w+_modulation", _bits(in_range, 8, 16)),
     "skinning weights": Group(r"skinning\.weight\d+", _bits(lambda bits: fractions(bits, 0.5), 8, 16)),
+    "weights of bodies": Group(r"layer\d+\.body_weights", _bits(lambda bits: fractions(bits, 1.0), 8, 16)),
     "splines": Group(
         r"layer\d+\.table",
         {f"rank {rank}": low_rank(rank) for rank in (12, 16, 24, 32, 48)}

@@ -12,14 +12,12 @@ from onnx import TensorProto
 from msdgs_export.layers.base import HEADS
 from msdgs_export.layers.chain import stored_constants, summed_deltas
 from msdgs_export.layers.graph import GraphBuilder, to_numpy
+from msdgs_export.layers.rotations import IDENTITY, rotation_columns, turned, unit_rows
 from msdgs_export.supports.base import Layout, SupportExport, SupportInputs
 from msdgs_export.supports.blocks import block_layout
 from msdgs_export.supports.skinning import Blend, columns_of, reshaped, skinned_deltas, skinned_poses
-from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.nodes import NodesSupport
-
-IDENTITY = np.array([1, 0, 0, 0], np.float32)
 
 
 class NodesExport(SupportExport):
@@ -61,11 +59,7 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
 
 def node_offsets(graph: GraphBuilder, nodes: str, translations: str, matrices: str) -> str:
     """[M, 3] offsets of motions that take nodes, [M, 3], by these translations, of matrices column by column."""
-    columns = graph.constant("nodes.columns", np.repeat(np.arange(3), 3))
-    factors = graph.node("Gather", [nodes, columns], "nodes.factors", axis=1)
-    add_columns = graph.constant("nodes.add_columns", np.tile(np.eye(3, dtype=np.float32), (3, 1)))
-    products = graph.node("Mul", [matrices, factors], "nodes.products")
-    rotated = graph.node("MatMul", [products, add_columns], "nodes.rotated")
+    rotated = turned(graph, "nodes.rotated", matrices, nodes)
     return graph.node("Sub", [graph.node("Add", [nodes, translations], "nodes.moved"), rotated], "nodes.offsets")
 
 
@@ -130,33 +124,3 @@ def _stretching(graph: GraphBuilder, name: str, rotations: str, stretches: str) 
     full = graph.node("Gemm", [stretches, graph.constant(f"{name}.place", place), one], f"{name}.stretch")
     transposed = [reshaped(graph, m, (-1, 3, 3), f"{name}.{k}") for k, m in (("left", full), ("right", rotations))]
     return reshaped(graph, graph.node("MatMul", transposed, f"{name}.product"), (-1, 9), name)
-
-
-def rotation_columns(graph: GraphBuilder, name: str, quats: str) -> str:
-    """[·, 9] rotation matrices, column by column: products of pairs of w, x, y, z, summed by a constant."""
-    first, second, factors = quaternion_products()
-    left, right = (
-        graph.node("Gather", [quats, graph.constant(f"{name}.{letter}", ids)], f"{name}.{side}", axis=1)
-        for letter, side, ids in (("i", "left", first), ("j", "right", second))
-    )
-    sums = graph.constant(f"{name}.sums", factors.transpose(0, 2, 1).reshape(10, 9))
-    ones = graph.constant(f"{name}.ones", np.eye(3, dtype=np.float32).reshape(9))
-    return graph.node("Gemm", [graph.node("Mul", [left, right], f"{name}.products"), sums, ones], name)
-
-
-def quaternion_products() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Indices, [10], of the factors of all products of two components, and what each adds to `to_matrix` beyond the
-    identity, [10, 3, 3]."""
-    first, second = np.triu_indices(4)
-    alone = to_matrix(np.eye(4)) - np.eye(3)
-    both = to_matrix(np.eye(4)[first] + np.eye(4)[second]) - np.eye(3) - alone[first] - alone[second]
-    return first, second, np.where((first == second)[:, None, None], alone[first], both).astype(np.float32)
-
-
-def unit_rows(graph: GraphBuilder, name: str, quats: str) -> str:
-    """Normalize quaternions, [·, 4], as training does."""
-    ones = graph.constant(f"{name}.four", np.ones((4, 4), np.float32))
-    least = graph.constant(f"{name}.least", np.array(MIN_NORM, np.float32))
-    sums = graph.node("MatMul", [graph.node("Mul", [quats, quats], f"{name}.squares"), ones], f"{name}.sums")
-    norms = graph.node("Max", [graph.node("Sqrt", [sums], f"{name}.norms"), least], f"{name}.divisors")
-    return graph.node("Div", [quats, norms], name)

@@ -11,9 +11,10 @@ import numpy as np
 from msdgs_export.layers.base import HEADS, ModelNotExportable
 from msdgs_export.layers.chain import stored_constants, summed_deltas
 from msdgs_export.layers.graph import GraphBuilder, to_numpy
+from msdgs_export.layers.rotations import IDENTITY, rotation_columns, unit_rows
 from msdgs_export.supports.base import Layout, SupportExport, SupportInputs
 from msdgs_export.supports.blocks import block_layout
-from msdgs_export.supports.nodes import IDENTITY, blended_parts, node_offsets, rotation_columns, unit_rows
+from msdgs_export.supports.nodes import blended_parts, node_offsets
 from msdgs_export.supports.skinning import Affine, columns_of, moved_means, rows_of
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.scgs import LOCAL_QUATS, SCGSSupport

@@ -98,6 +98,9 @@ class DeformationLayer(nn.Module):
         chain moves, and all randomness is the generator's, which is on the CPU."""
         return {}
 
+    def on_deform_start(self, points: Tensor) -> None:
+        """Called before the first step with deformation; `points`, [N, 3], are canonical positions of what moves."""
+
     def on_window(self, before: float, after: float) -> None:
         """Extrapolate when the time window widens; half widths, as fractions of the time range."""
 

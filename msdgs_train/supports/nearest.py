@@ -1,4 +1,4 @@
-"""Nearest and farthest points."""
+"""Nearest points."""
 
 import numpy as np
 import torch
@@ -29,15 +29,3 @@ def nearest_by_sorting(points: Tensor, centers: Tensor, count: int) -> Tensor:
     most = min(count, len(centers))
     parts = [torch.cdist(chunk, centers).topk(most, largest=False).indices for chunk in points.detach().split(CHUNK)]
     return torch.cat(parts) if parts else points.new_zeros(0, most, dtype=torch.int64)
-
-
-def farthest_points(points: Tensor, count: int, first: int) -> tuple[Tensor, Tensor]:
-    """Farthest-point sampling: [count] ids of N points, [N, D], each the farthest from those before it, and the
-    distance of every point, [N], to the nearest of them."""
-    chosen, ids = first, []
-    distances = points.new_full((len(points),), torch.inf)
-    for _ in range(count):
-        ids.append(chosen)
-        distances = torch.minimum(distances, (points - points[chosen]).norm(dim=1))
-        chosen = int(distances.argmax())
-    return torch.tensor(ids, device=points.device), distances

@@ -21,9 +21,9 @@ from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import check_size
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.parameters import LearningRate
+from msdgs_train.layers.placement import farthest_points
 from msdgs_train.layers.quaternions import identity_like, rotation_matrices, stretch_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from msdgs_train.supports.nearest import farthest_points
 from msdgs_train.supports.skinning import skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MOTION
 

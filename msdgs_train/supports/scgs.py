@@ -24,9 +24,10 @@ from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.base import check_size
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.parameters import ParamGroup, constant
+from msdgs_train.layers.placement import farthest_points
 from msdgs_train.layers.quaternions import rotation_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from msdgs_train.supports.nearest import farthest_points, nearest
+from msdgs_train.supports.nearest import nearest
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST
 
 GAUSSIAN_HYPER, NODE_HYPER = -1e-2, 1e-2

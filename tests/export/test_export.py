@@ -82,6 +82,8 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
         (300, {"support": NODES, "layers": ("mlp", "mlp"), "modulation_targets": ("quats", "means")}, 300),
         (300, {"support": replace(NODES, num_nodes=9, k_nearest=2), "layers": ("plane",), "weights": False}, 300),
         (300, {"support": replace(NODES, num_nodes=300), "layers": (replace(SPLINE, affine=False), "mlp")}, 300),
+        (300, {"support": replace(NODES, num_nodes=9), "layers": ("bodies", "spline", "mlp"), "noise": 0.03}, 300),
+        (300, {"support": NODES, "layers": ("mlp", "bodies"), "embedding_dim": 0}, 300),
         (1, {"support": NODES, "layers": ("mlp",)}, 1),
         (0, {"support": NODES, "layers": ("spline",)}, 0),
         (300, {"layers": ()}, 0),

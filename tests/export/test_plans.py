@@ -33,7 +33,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.base import SceneBounds
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from tests.support.models import HASH4D, MLP, NODES, PLANE, SCENE, SPLINE, random_model
+from tests.support.models import BODIES, HASH4D, MLP, NODES, PLANE, SCENE, SPLINE, random_model
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -47,6 +47,7 @@ FORMATS: dict[str, dict[str, Any]] = {
     "mixed": {"layers": (SLOW, COARSE), "noise": 0.02},
     "splines on nodes": {"layers": (SPLINE,), **ON_NODES},
     "mlp on nodes": {"layers": (SLOW, SLOW), **ON_NODES},
+    "bodies on nodes": {"layers": (BODIES, SPLINE, SLOW), **ON_NODES},
     "plane on nodes": {"layers": (COARSE,), **ON_NODES},
     "mixed on nodes": {"layers": (SPLINE, COARSE, SLOW), **ON_NODES},
 }

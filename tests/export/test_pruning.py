@@ -308,7 +308,7 @@ def test_gaussians_that_appear_later_are_kept_and_those_that_never_change_are_st
     assert written.measured_error["opacities"] <= tolerance("export.relative")
 
 
-@pytest.mark.parametrize("kind", ["spline", "mlp", "plane"])
+@pytest.mark.parametrize("kind", ["spline", "bodies", "mlp", "plane"])
 def test_layers_on_nodes_keep_all_heads(tmp_path: Path, kind: str):
     """The file moves Gaussians as the model does, whose order alone is changed."""
     model = random_model(40, noise=0.2, support=NODES, layers=(kind,))

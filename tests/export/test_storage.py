@@ -35,7 +35,7 @@ from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_train.gaussians.model_file import load_model
 from tests.support import reference_torch
 from tests.support.images import psnr
-from tests.support.models import HASH4D, MLP, NODES, SCENE, moving_object, random_model, saved
+from tests.support.models import BODIES, HASH4D, MLP, NODES, SCENE, moving_object, random_model, saved
 from tests.support.scenes import unit_quats
 from tests.support.sound_scenes import RESOLVED
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
@@ -103,6 +103,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "mlp": {"layers": (replace(MLP, xyz_frequencies=2),) * 2, "noise": 0.02},
     "plane": {"layers": ("plane",), "modulation_targets": ("quats", "means")},
     "nodes": {"layers": ("spline", "mlp"), "support": NODES, "noise": 0.02, "embedding_dim": 0},
+    "bodies": {"layers": (BODIES,), "support": replace(NODES, num_nodes=99), "noise": 0.02, "embedding_dim": 0},
     "still": {"layers": ()},
     "hash4d": {"layers": (HASH4D,), "scale_space": "linear", "weights": False, "noise": 0.02, "embedding_dim": 0},
 }

@@ -19,6 +19,7 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo, load_model, save_model
 from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.bodies import BodiesConfig
 from msdgs_train.layers.hash4d import Hash4DConfig
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.layers.plane import PlaneConfig
@@ -56,6 +57,7 @@ SCENE = SceneInfo(
 MLP = MLPConfig(width=32, depth=3, time_width=16, time_features=8)
 PLANE = PlaneConfig()
 SPLINE = SplineConfig(num_knots=3)
+BODIES = BodiesConfig(num_knots=4, num_bodies=3)
 HASH4D = Hash4DConfig(
     levels=3,
     coarsest=(4, 4, 3),
@@ -70,7 +72,7 @@ HASH4D = Hash4DConfig(
     reach=1.2,
 )
 """Of both kinds of grids, the finest level or more are hashed."""
-SMALL_LAYERS: dict[str, LayerConfig] = {layer.kind: layer for layer in (MLP, PLANE, SPLINE, HASH4D)}
+SMALL_LAYERS: dict[str, LayerConfig] = {layer.kind: layer for layer in (MLP, PLANE, SPLINE, HASH4D, BODIES)}
 NODES = NodesConfig(num_nodes=4)
 
 
@@ -90,6 +92,8 @@ def random_model(count: int = 300, seed: int = 0, noise: float = 0.05, **config:
         model = DynamicGaussians(settings, gaussians)
         if isinstance(model.support, NodesSupport):
             _place_nodes(model.support, gaussians)
+            for layer in model.deformation:
+                layer.on_deform_start(model.support.nodes)
         for parameter in model.parameters():
             if parameter.requires_grad and parameter is not gaussians.means:
                 parameter += noise * torch.randn_like(parameter)

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.base import DeformationLayer
+from msdgs_train.layers.bodies import BodiesLayer
+from msdgs_train.layers.curves import CurveLayer
 from msdgs_train.layers.hash4d import Hash4DLayer
 from msdgs_train.layers.hash_grid import HashGrid
 from msdgs_train.layers.mlp import MLPLayer
@@ -91,13 +93,30 @@ def plain_plane(layer: PlaneLayer, means: np.ndarray, t: float) -> np.ndarray:
     return np.concatenate([linear(head, np.maximum(linear(hidden, features), 0)) for hidden, head in heads], axis=1)
 
 
-def plain_curves(layer: SplineLayer, t: float) -> np.ndarray:
-    """[M, 13] translations, quaternions of any length, and stretches on uniform cubic B-splines."""
-    count = layer.config.num_knots
+def plain_curves(layer: CurveLayer, curves: list[torch.Tensor], t: float) -> np.ndarray:
+    """[C, ·] values of uniform cubic B-splines side by side."""
+    count = layer.num_knots
     first, length = float(layer.first_time), count / float(layer.knots_per_time)
     knots = first + np.arange(-3, count + 4) / count * length
-    curves = np.concatenate([array(layer.transls), array(layer.rots), array(layer.stretches)], axis=2)
-    return BSpline(knots, curves, 3)(np.clip(t, first, first + length))
+    values = np.concatenate([array(curve) for curve in curves], axis=2)
+    return BSpline(knots, values, 3)(np.clip(t, first, first + length))
+
+
+def plain_bodies(layer: BodiesLayer, means: np.ndarray, t: float) -> PlainDeltas:
+    """Each body turns a node about its center and shifts it; the node takes the mean by softmax."""
+    poses, centers, logits = (
+        plain_curves(layer, [layer.transls, layer.rots], t),
+        array(layer.centers),
+        array(layer.logits),
+    )
+    shifts, turns = np.zeros((len(means), 3)), np.zeros((len(means), 4))
+    for m, mean in enumerate(means):
+        weights = np.exp(logits[m]) / np.exp(logits[m]).sum()
+        for weight, pose, center in zip(weights, poses, centers, strict=True):
+            moved = rotation(pose[3:]).apply(mean - center) + center + float(layer.size) * pose[:3]
+            shifts[m] += weight * (moved - mean)
+            turns[m] += weight * (pose[3:] / np.linalg.norm(pose[3:]) - [1, 0, 0, 0])
+    return PlainDeltas(shifts, np.zeros((len(means), 3)), turns)
 
 
 def plain_hash_features(grid: HashGrid, places: np.ndarray) -> np.ndarray:
@@ -143,8 +162,11 @@ def plain_hash4d(layer: Hash4DLayer, means: np.ndarray, t: float) -> np.ndarray:
 
 def plain_step(layer: DeformationLayer, means: np.ndarray, t: float) -> PlainDeltas:
     """One layer, of a kind of this package, at points [N, 3]."""
+    if isinstance(layer, BodiesLayer):
+        return plain_bodies(layer, means, t)
     if isinstance(layer, SplineLayer):
-        transls, rots, stretches = np.split(plain_curves(layer, t), [3, 7], axis=1)
+        curves = [layer.transls, layer.rots, layer.stretches]
+        transls, rots, stretches = np.split(plain_curves(layer, curves, t), [3, 7], axis=1)
         return PlainDeltas(transls, stretches, rots - [1, 0, 0, 0])
     if isinstance(layer, Hash4DLayer):
         columns = plain_hash4d(layer, means, t)

@@ -24,6 +24,7 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.bodies import BodiesConfig
 from msdgs_train.layers.hash4d import Hash4DConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.parameters import ParamGroup, constant
@@ -46,6 +47,7 @@ MLP = MLPConfig(width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_w
 PLANE = PlaneConfig(features=4, resolution=6, time_resolution=5, width=8)
 TINY_GRIDS: dict[str, Any] = {"levels": 3, "log2_rows": 8, "canonical_levels": 3, "canonical_log2_rows": 8, "width": 8}
 """Sizes of a hash layer."""
+BODIES = BodiesConfig(num_knots=8, num_bodies=3)
 HASH4D = Hash4DConfig(**TINY_GRIDS, depth=1)
 SMALL_MODEL = ModelConfig(sh_degree=1, layers=(MLP, MLP), embedding_dim=4)
 SPLINES = ModelConfig(
@@ -55,7 +57,7 @@ MODELS = {
     "mlp": SMALL_MODEL,
     "mlp on nodes": dataclasses.replace(SMALL_MODEL, support=NodesConfig(num_nodes=6)),
     "mixed on nodes": dataclasses.replace(
-        SMALL_MODEL, support=NodesConfig(num_nodes=6), layers=(SplineConfig(num_knots=8), PLANE, MLP)
+        SMALL_MODEL, support=NodesConfig(num_nodes=6), layers=(BODIES, SplineConfig(num_knots=8), PLANE, MLP)
     ),
     "hash4d": dataclasses.replace(SMALL_MODEL, layers=(HASH4D,), scale_space="linear"),
     "mixed on gaussians": dataclasses.replace(SMALL_MODEL, layers=(PLANE, MLP)),

@@ -19,8 +19,8 @@ from msdgs_train.gaussians.scale_space import activated_scales
 from msdgs_train.gaussians.surgery import MOMENTS, RowSurgery
 from msdgs_train.layers.mlp import MLPLayer
 from msdgs_train.layers.parameters import ParamGroup, constant
+from msdgs_train.layers.placement import farthest_points
 from msdgs_train.supports.base import CanonicalPoints
-from msdgs_train.supports.nearest import farthest_points
 from msdgs_train.supports.scgs import NodeRows, SCGSConfig, SCGSSupport
 from msdgs_train.systems.base import Moment, Target, ViewLoss
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting

@@ -38,6 +38,7 @@ def rewritten(path: Path, part: str | None = None, **changes: object) -> None:
         *({}, {"count": 0}, {"count": 1}, {"layers": ()}, {"embedding_dim": 0}, {"sh_degree": 0}),
         {"layers": ("plane", "mlp")},
         {"layers": ("spline", "plane", "mlp"), "support": NODES},
+        {"layers": ("bodies", "spline"), "support": NODES},
         {"layers": ("mlp",), "support": NodesConfig(num_nodes=1, k_nearest=3)},
     ],
 )

@@ -7,7 +7,9 @@ import torch
 
 from msdgs_train.gaussians.modulation import Modulation
 from msdgs_train.layers.base import DeformationLayer, Heads
+from msdgs_train.layers.bodies import BodiesConfig, BodiesLayer
 from msdgs_train.layers.chain import MultiStepDeformation
+from msdgs_train.layers.curves import CurveLayer
 from msdgs_train.layers.hash4d import Hash4DLayer
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer, frequency_matrix, positional_encoding
 from msdgs_train.layers.plane import PlaneLayer
@@ -45,7 +47,13 @@ def test_the_modulation_has_the_papers_size_starts_at_one_and_stays_bounded():
 
 @pytest.mark.parametrize(
     "layer",
-    [MLPLayer(MLPConfig(depth=2)), PlaneLayer(), SplineLayer(SplineConfig(), 9, (0.0, 1.0)), Hash4DLayer(HASH4D)],
+    [
+        MLPLayer(MLPConfig(depth=2)),
+        PlaneLayer(),
+        SplineLayer(SplineConfig(num_knots=8), 9, (0.0, 1.0)),
+        Hash4DLayer(HASH4D),
+        BodiesLayer(BodiesConfig(num_knots=8), 9, (0.0, 1.0)),
+    ],
 )
 def test_a_new_layer_moves_nothing_but_has_weights(layer: DeformationLayer):
     with torch.no_grad():
@@ -53,7 +61,7 @@ def test_a_new_layer_moves_nothing_but_has_weights(layer: DeformationLayer):
     assert max(float(delta.abs().max()) for delta in step[:3]) <= tolerance("float32.relative")
     assert step.weight.shape == (9, 1)
     assert ((step.weight > 0) & (step.weight <= 1)).all()
-    assert isinstance(layer, SplineLayer) == (step.weight.unique().numel() == 1)
+    assert isinstance(layer, CurveLayer) == (step.weight.unique().numel() == 1)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

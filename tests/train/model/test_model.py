@@ -16,6 +16,7 @@ from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.gaussians.scale_space import MIN_SCALE
 from msdgs_train.layers.base import LayerConfig
+from msdgs_train.layers.bodies import BodiesConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.parts import to_text
 from msdgs_train.layers.plane import PlaneConfig
@@ -24,7 +25,7 @@ from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.base import SupportConfig
 from msdgs_train.supports.gaussians import GaussiansConfig
 from msdgs_train.supports.nodes import NodesConfig
-from tests.support.models import NODES, SPLINE, random_model, small_config
+from tests.support.models import BODIES, NODES, SPLINE, random_model, small_config
 from tests.support.tolerances import assert_close
 
 
@@ -141,7 +142,7 @@ def test_quaternions_without_direction_become_identity():
     [
         *(("sh_degree", degree) for degree in (4, -1)),
         *(("layers", layers) for layers in (-1, 1.5, True, "mlp")),
-        ("layers.0` must be of another kind", (SPLINE,)),  # curves are of nodes
+        *(("layers.0` must be of another kind", (layer,)) for layer in (SPLINE, BODIES)),  # curves are of nodes
         ("support", "nodes"),
         *(("support.num_nodes", NodesConfig(num_nodes=count)) for count in (0, 2.0)),  # pyright: ignore
         *(("support.k_nearest", NodesConfig(k_nearest=count)) for count in (0, 9)),
@@ -177,6 +178,9 @@ def test_what_nodes_cannot_change_is_refused(field: str):
         ("multires", PlaneConfig(multires=())),
         ("multires", PlaneConfig(multires=(1, 0))),
         ("num_knots", SplineConfig(num_knots=-1)),
+        ("num_bodies", BodiesConfig(num_bodies=0)),
+        ("lr_init", BodiesConfig(lr_init=0.0)),
+        ("body_smoothness_weight", BodiesConfig(body_smoothness_weight=-1.0)),
     ],
 )
 def test_impossible_sizes_are_refused_by_layer_and_name(setting: str, layer: LayerConfig):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_train.supports.nearest import farthest_points, nearest, nearest_by_sorting
+from msdgs_train.layers.placement import farthest_points
+from msdgs_train.supports.nearest import nearest, nearest_by_sorting
 
 
 def plain_nearest(points: np.ndarray, centers: np.ndarray, count: int) -> list[list[int]]:

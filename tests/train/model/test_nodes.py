@@ -16,7 +16,7 @@ from msdgs_train.supports.base import CanonicalPoints
 from msdgs_train.supports.nodes import NodesConfig, NodesSupport
 from msdgs_train.supports.skinning import skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MIN_STRETCH
-from tests.support.models import MLP, NODES, PLANE, SPLINE, random_model
+from tests.support.models import BODIES, MLP, NODES, PLANE, SPLINE, random_model
 from tests.support.reference_deformation import plain_pose, rotation
 from tests.support.tolerances import assert_close, tolerance
 
@@ -29,6 +29,9 @@ CHAINS = {
     "plane": (PLANE,),
     "spline, plane, mlp": (SPLINE, PLANE, MLP),
     "mlp, spline": (MLP, SPLINE),
+    "bodies": (BODIES,),
+    "bodies, spline, mlp": (BODIES, SPLINE, MLP),
+    "mlp, bodies": (MLP, BODIES),
 }
 
 

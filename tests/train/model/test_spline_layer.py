@@ -9,6 +9,8 @@ import torch
 
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.engine.schedule import Schedule
+from msdgs_train.layers.base import PAPER_HEADS, SceneBounds
+from msdgs_train.layers.bodies import BodiesConfig
 from msdgs_train.layers.spline import SplineConfig, SplineLayer
 from msdgs_train.supports.nodes import NodesSupport
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
@@ -44,8 +46,9 @@ def test_motions_are_on_splines(t: float) -> None:
     assert torch.equal(step.weight, torch.ones(3, 1, dtype=torch.float64))
 
 
-def test_beyond_the_window_translations_stay_and_rotations_continue() -> None:
-    layer = SplineLayer(SplineConfig(num_knots=40), 1, (0.0, 1.0))
+@pytest.mark.parametrize("config", [SplineConfig(num_knots=40), BodiesConfig(num_knots=40)])
+def test_beyond_the_window_translations_stay_and_rotations_continue(config: SplineConfig | BodiesConfig) -> None:
+    layer = config.build(SceneBounds(), PAPER_HEADS, 1)
     angles = 0.1 * torch.arange(43)
     with torch.no_grad():
         layer.transls[:, 0, 0] = torch.arange(43.0)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from msdgs_train.layers import arrays
 from msdgs_train.layers.base import SceneBounds
+from msdgs_train.layers.bodies import BodiesConfig, BodiesLayer
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer, frequency_matrix, positional_encoding
 from msdgs_train.layers.plane import PlaneConfig, PlaneGrid, PlaneLayer
 from msdgs_train.layers.precision import Precision, chosen_precision, matrix_products, trunk_precision
@@ -111,13 +112,14 @@ def test_skinning(without_kernels: Callable[[], None], name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DTYPES)
-@pytest.mark.parametrize("kind", ["mlp", "plane", "spline"])
+@pytest.mark.parametrize("kind", ["mlp", "plane", "spline", "bodies"])
 def test_layers(without_kernels: Callable[[], None], name: str, kind: str) -> None:
     torch.manual_seed(0)
     layer = {
         "mlp": lambda: MLPLayer(SMALL_MLP),
         "plane": lambda: PlaneLayer(PlaneConfig(4, 6, 5, 8), SceneBounds()),
         "spline": lambda: SplineLayer(SplineConfig(num_knots=5), 30, (0.0, 1.0)),
+        "bodies": lambda: BodiesLayer(BodiesConfig(num_knots=5, num_bodies=4), 30, (0.0, 1.0)),
     }[kind]().to(DTYPES[name])
     for parameter in layer.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
