@@ -102,7 +102,7 @@ class Avx512Renderer:
         self._library.draw(
             self._renderer,
             ctypes.byref(_Scene(len(g), *(array.ctypes.data for array in arrays))),
-            ctypes.byref(_View(*(tuple(v.ravel()) if isinstance(v, np.ndarray) else v for v in values))),
+            ctypes.byref(_View(*(tuple(np.ravel(v)) if isinstance(v, tuple | np.ndarray) else v for v in values))),
             ctypes.c_void_p(rgb.ctypes.data),
             ctypes.c_void_p(seconds.ctypes.data),
         )

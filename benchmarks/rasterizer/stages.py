@@ -12,6 +12,7 @@ from msdgs_serve.rasterizer import GSPLAT, rasterize
 from msdgs_serve.rasterizer.compositing import composite
 from msdgs_serve.rasterizer.counts import count_splats
 from msdgs_serve.rasterizer.projection import project
+from msdgs_serve.rasterizer.scratch import release_scratch
 from msdgs_serve.rasterizer.tiles import bin_into_tiles
 
 STAGES = ("project", "bin", "composite", "total")
@@ -73,6 +74,7 @@ def memory_of(case: Case) -> int:
     """Peak bytes of NumPy arrays while a frame is drawn, without the Gaussians and the frame itself. Scratch memory of
     the threads, some 20 kB each, belongs to numba and isn't counted."""
     rasterize(case.gaussians, case.camera)
+    release_scratch()
     tracemalloc.start()
     try:
         frame = rasterize(case.gaussians, case.camera)

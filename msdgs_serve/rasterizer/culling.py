@@ -43,9 +43,9 @@ def _test_boxes(boxes: np.ndarray, sizes: np.ndarray, view: View, seen: np.ndarr
         stretch_x, stretch_y = view.fx, view.fy
     for k in range(len(boxes)):
         box = boxes[k]
-        x = r[0, 0] * box[0] + r[0, 1] * box[1] + r[0, 2] * box[2] + t[0]
-        y = r[1, 0] * box[0] + r[1, 1] * box[1] + r[1, 2] * box[2] + t[1]
-        z = r[2, 0] * box[0] + r[2, 1] * box[1] + r[2, 2] * box[2] + t[2]
+        x = r[0][0] * box[0] + r[0][1] * box[1] + r[0][2] * box[2] + t[0]
+        y = r[1][0] * box[0] + r[1][1] * box[1] + r[1][2] * box[2] + t[1]
+        z = r[2][0] * box[0] + r[2][1] * box[1] + r[2][2] * box[2] + t[2]
         depth = _half_width(r, 0.0, 0.0, 1.0, box)
         if z + depth <= 0.999 * view.near_plane:
             seen[k] = 0
@@ -73,9 +73,9 @@ def _test_boxes(boxes: np.ndarray, sizes: np.ndarray, view: View, seen: np.ndarr
 
 
 @kernel
-def _half_width(r: np.ndarray, of_x: float, of_y: float, of_z: float, box: np.ndarray) -> float:
+def _half_width(r: tuple, of_x: float, of_y: float, of_z: float, box: np.ndarray) -> float:
     """Return by how much of_x x + of_y y + of_z z, in camera axes, exceeds its value at the center of a box."""
     total = 0.0
     for axis in range(3):
-        total += abs(of_x * r[0, axis] + of_y * r[1, axis] + of_z * r[2, axis]) * box[3 + axis]
+        total += abs(of_x * r[0][axis] + of_y * r[1][axis] + of_z * r[2][axis]) * box[3 + axis]
     return total

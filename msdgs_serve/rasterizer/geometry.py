@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.simd.exponential import arctangent
 from msdgs_serve.rasterizer.simd.types import Vector
 from msdgs_serve.rasterizer.simd.vectors import converted, filled, maximum, minimum, spread, square_root
@@ -20,13 +20,13 @@ def rotation_columns(w: Vector, x: Vector, y: Vector, z: Vector) -> tuple:
 
 
 @kernel
-def rotate(rotation: np.ndarray, vector: tuple) -> tuple[Vector, Vector, Vector]:
+def rotate(rotation: tuple, vector: tuple) -> tuple[Vector, Vector, Vector]:
     """Return a matrix [3, 3] times a vector [3]."""
     a, b, c = vector
     return (
-        rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c,
-        rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c,
-        rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c,
+        rotation[0][0] * a + rotation[0][1] * b + rotation[0][2] * c,
+        rotation[1][0] * a + rotation[1][1] * b + rotation[1][2] * c,
+        rotation[2][0] * a + rotation[2][1] * b + rotation[2][2] * c,
     )
 
 
@@ -52,7 +52,7 @@ def covariance2d(half: tuple, eps2d: float) -> tuple[Vector, Vector, Vector, Vec
     return xx + eps2d, xy, yy + eps2d, sharp, sharp + eps2d * (xx + yy) + eps2d * eps2d
 
 
-@kernel
+@inlined_kernel
 def project_points(view: View, x: Vector, y: Vector, z: Vector) -> tuple:
     """Project points in camera axes. Return u and v in pixels and the Jacobian, [2][3]."""
     zero = filled(0, z)
@@ -96,7 +96,7 @@ def direction(
     """Return the unit viewing directions to points in the world, in the dtype of `like`."""
     if view.model == ORTHOGRAPHIC:
         r = view.rotation
-        return spread(like.dtype.type(r[2, 0])), spread(like.dtype.type(r[2, 1])), spread(like.dtype.type(r[2, 2]))
+        return spread(like.dtype.type(r[2][0])), spread(like.dtype.type(r[2][1])), spread(like.dtype.type(r[2][2]))
     # divided by the depth before squaring: the square of a distance may overflow float32
     per_depth, position = 1 / depth, view.position
     dx = converted((x - position[0]) * per_depth, like)

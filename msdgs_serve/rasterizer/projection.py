@@ -13,8 +13,10 @@ from msdgs_serve.rasterizer.culling import seen_blocks
 from msdgs_serve.rasterizer.geometry import covariance2d, direction, half_axis, project_points, rotate, rotation_columns
 from msdgs_serve.rasterizer.harmonics import raw_colors
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.scratch import scratch
 from msdgs_serve.rasterizer.simd.exponential import log2
 from msdgs_serve.rasterizer.simd.memory import (
+    append_keys,
     load_four_columns,
     load_or,
     load_triples,
@@ -28,7 +30,6 @@ from msdgs_serve.rasterizer.simd.vectors import (
     bits_of,
     converted,
     fma,
-    lowest_bit,
     maximum,
     minimum,
     negative,
@@ -36,7 +37,7 @@ from msdgs_serve.rasterizer.simd.vectors import (
     spread,
     square_root,
 )
-from msdgs_serve.rasterizer.splats import ROOT_SCALE, Splats, empty_records
+from msdgs_serve.rasterizer.splats import RECORD, ROOT_SCALE, Splats
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions, View, view_of
 from msdgs_serve.scene.camera import Camera
 from msdgs_serve.scene.gaussians import Gaussians
@@ -64,9 +65,9 @@ def project(
         gaussians = _without_ghosts(gaussians, camera)
     count, dtype = len(gaussians), gaussians.means.dtype
     view = view_of(camera, options, tiles)
-    records = empty_records(-(-count // NUM_LANES) * NUM_LANES, dtype)  # whole vectors: stores need no mask
-    rectangles = np.empty((count, 4), np.uint16)
-    keys = np.empty(count, np.uint64)
+    rows = -(-count // NUM_LANES) * NUM_LANES  # whole vectors: stores need no mask
+    records, rectangles = scratch((rows, RECORD), dtype), scratch((count, 4), np.uint16)
+    keys = scratch((rows,), np.uint64)
     g = gaussians
     arrays = (g.means, g.quats, g.scales, g.opacities, g.sh.reshape(count, 3 * g.sh.shape[1]))
     found = np.empty((part_count(count), 5), np.int64)
@@ -142,7 +143,6 @@ def _project_range(
     real = records.dtype.type
     zero = spread(real(0))
     double = np.empty(1, np.float64)
-    depths = np.empty(NUM_LANES, records.dtype)
     r, t = view.rotation, view.translation
     first_column, first_row = spread(real(view.left // TILE)), spread(real(view.top // TILE))
     past_column, past_row = spread(real(-(-view.right // TILE))), spread(real(-(-view.bottom // TILE)))
@@ -152,7 +152,8 @@ def _project_range(
         (scales.reshape(-1), np.uint64(3)),
         (sh.reshape(-1), np.uint64(sh.shape[1])),
     )
-    found, nearest, farthest, valid = start, np.uint64(0xFFFFFFFF), np.uint64(0), True
+    found, valid = start, True
+    nearest, farthest = spread(real(np.inf)), zero
     for first in range(start, stop, NUM_LANES):
         if len(seen) > 0 and seen[first // BLOCK] == 0:
             continue
@@ -165,9 +166,9 @@ def _project_range(
         opacity = converted(load_or(opacities, first, spread(opacities.dtype.type(0))), double)
         qs, ss = load_four_columns(quats, first, 0), load_triples(scales, first)
         usable = _usable(mean, qs, ss, opacity)
-        x = fma(spread(r[0, 0]), wx, fma(spread(r[0, 1]), wy, fma(spread(r[0, 2]), wz, spread(t[0]))))
-        y = fma(spread(r[1, 0]), wx, fma(spread(r[1, 1]), wy, fma(spread(r[1, 2]), wz, spread(t[1]))))
-        z = fma(spread(r[2, 0]), wx, fma(spread(r[2, 1]), wy, fma(spread(r[2, 2]), wz, spread(t[2]))))
+        x = fma(spread(r[0][0]), wx, fma(spread(r[0][1]), wy, fma(spread(r[0][2]), wz, spread(t[0]))))
+        y = fma(spread(r[1][0]), wx, fma(spread(r[1][1]), wy, fma(spread(r[1][2]), wz, spread(t[1]))))
+        z = fma(spread(r[2][0]), wx, fma(spread(r[2][1]), wy, fma(spread(r[2][2]), wz, spread(t[2]))))
         past_end = np.uint64(0xFFFF) << np.uint64(min(stop - first, NUM_LANES))
         valid = valid and (bits_of(usable) | past_end) & np.uint64(0xFFFF) == np.uint64(0xFFFF)
         drawn = (z > view.near_plane) & (opacity >= view.alpha_min)
@@ -235,15 +236,19 @@ def _project_range(
             select(drawn, minimum(scale * (v + extent_y) + 1, past_row) - first_row, zero),
         )
         store_uint16(rectangles, first, sides)
-        store(depths, 0, converted(z, records))
-        while bits != np.uint64(0):
-            lane = lowest_bit(bits)
-            bits &= bits - np.uint64(1)
-            depth = depth_bits(depths[lane])
-            nearest, farthest = min(nearest, depth), max(farthest, depth)
-            keys[np.uint64(found)] = (depth << np.uint64(32)) | (np.uint64(first) + lane)
-            found += 1
-    return found, int(nearest), int(farthest), valid
+        depth = converted(z, records)
+        nearest, farthest = (
+            minimum(nearest, select(drawn, depth, nearest)),
+            maximum(farthest, select(drawn, depth, zero)),
+        )
+        found = append_keys(keys, found, bits, depth, first)
+    ends = np.empty(2 * NUM_LANES, records.dtype)
+    store(ends, 0, nearest)
+    store(ends, NUM_LANES, farthest)
+    low, high = ends[0], ends[NUM_LANES]
+    for lane in range(1, NUM_LANES):
+        low, high = min(low, ends[lane]), max(high, ends[NUM_LANES + lane])
+    return found, int(depth_bits(low)), int(depth_bits(high)), valid
 
 
 @kernel

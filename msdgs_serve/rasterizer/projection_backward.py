@@ -98,9 +98,9 @@ def _backward_part(
         drawn = record[_EXTENT] > 0
         mean = load_triples(means, first)
         wx, wy, wz = converted(mean[0], double), converted(mean[1], double), converted(mean[2], double)
-        x = w[0, 0] * wx + w[0, 1] * wy + w[0, 2] * wz + t[0]
-        y = w[1, 0] * wx + w[1, 1] * wy + w[1, 2] * wz + t[1]
-        z = w[2, 0] * wx + w[2, 1] * wy + w[2, 2] * wz + t[2]
+        x = w[0][0] * wx + w[0][1] * wy + w[0][2] * wz + t[0]
+        y = w[1][0] * wx + w[1][1] * wy + w[1][2] * wz + t[1]
+        z = w[2][0] * wx + w[2][1] * wy + w[2][2] * wz + t[2]
         _, _, jacobian = project_points(view, x, y, z)
         (j00, _, j02), (_, j11, j12) = jacobian
         qs, ss = load_four_columns(quats, first, 0), load_triples(scales, first)
@@ -168,18 +168,18 @@ def _backward_part(
 
 
 @kernel
-def _rotate_back(w: np.ndarray, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
+def _rotate_back(w: tuple, x: Vector, y: Vector, z: Vector) -> tuple[Vector, Vector, Vector]:
     """Return Wᵀ times a vector."""
     return (
-        w[0, 0] * x + w[1, 0] * y + w[2, 0] * z,
-        w[0, 1] * x + w[1, 1] * y + w[2, 1] * z,
-        w[0, 2] * x + w[1, 2] * y + w[2, 2] * z,
+        w[0][0] * x + w[1][0] * y + w[2][0] * z,
+        w[0][1] * x + w[1][1] * y + w[2][1] * z,
+        w[0][2] * x + w[1][2] * y + w[2][2] * z,
     )
 
 
 @kernel
 def _axis_gradient(
-    w: np.ndarray, jacobian: tuple, covariance: tuple, half: tuple, axis: tuple, seen: tuple, size: Vector
+    w: tuple, jacobian: tuple, covariance: tuple, half: tuple, axis: tuple, seen: tuple, size: Vector
 ) -> tuple:
     """Return, for one axis, d loss / d scale, / d world axis, [3], and / d (j00, j02, j11, j12), [4]."""
     v_xx, v_xy, v_yy = covariance

@@ -16,7 +16,6 @@ RECORD = NUM_LANES
 )
 ROOT_SCALE = math.sqrt(0.5 / math.log(2))
 """Factor on the root of the inverse covariance, so that alpha = 2^(LOG2_OPACITY - |root @ d|²)."""
-CACHE_LINE_BYTES = 64
 
 
 class Splats(NamedTuple):
@@ -30,7 +29,7 @@ class Splats(NamedTuple):
 
     records: np.ndarray  # [N, RECORD]
     rectangles: np.ndarray  # [N, 4] uint16: tile columns [first, past), then tile rows [first, past), from `origin`
-    keys: np.ndarray  # [N] uint64: for each drawn splat the bits of its float32 depth above its index
+    keys: np.ndarray  # [N or more] uint64: for each drawn splat the bits of its float32 depth above its index
     drawn: np.ndarray  # [P, 2] start and stop of the ranges of `keys` that are filled, by index
     depth_range: tuple[int, int]  # bits of the smallest and the largest drawn depth
     origin: tuple[int, int]  # upper left corner of the first tile in the camera's image, pixels
@@ -45,11 +44,3 @@ class Splats(NamedTuple):
     def extents(self) -> np.ndarray:
         """[N, 2] half the size of each footprint's box in pixels, 0 if the splat isn't drawn."""
         return self.records[:, EXTENT_X : EXTENT_Y + 1]
-
-
-def empty_records(count: int, dtype: np.dtype) -> np.ndarray:
-    """Return [count, RECORD] aligned to 64 bytes, so that a float32 record is one cache line instead of two."""
-    size = count * RECORD * dtype.itemsize
-    raw = np.empty(size + CACHE_LINE_BYTES, np.uint8)
-    start = -raw.ctypes.data % CACHE_LINE_BYTES
-    return raw[start : start + size].view(dtype).reshape(count, RECORD)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.scratch import scratch
 from msdgs_serve.rasterizer.simd.memory import prefetch
 from msdgs_serve.rasterizer.splats import Splats
 from msdgs_serve.rasterizer.view import TILE
@@ -54,7 +55,7 @@ def bin_into_tiles(splats: Splats, width: int, height: int, max_pairs: int = sys
         return TileLists(offsets, splat_ids, columns, rows)
     order = _sorted_by_depth(splats, digits)
     parts = _parts(count)
-    rectangles = np.empty((count, 4), np.uint16)
+    rectangles = scratch((count, 4), np.uint16)
     corners = np.zeros((len(parts), rows + 1, columns + 1), np.int32)
     run_parallel(
         _gather_rectangles,
@@ -64,7 +65,7 @@ def bin_into_tiles(splats: Splats, width: int, height: int, max_pairs: int = sys
     _place_parts(corners, offsets, cursors)
     if offsets[-1] > max_pairs:
         raise TooManyPairs
-    splat_ids = np.empty(offsets[-1], np.uint32)
+    splat_ids = scratch((int(offsets[-1]),), np.uint32)
     run_parallel(
         _append_to_tiles, [(*part, order, rectangles, cursors[k], columns, splat_ids) for k, part in enumerate(parts)]
     )
@@ -89,10 +90,10 @@ def _sorted_by_depth(splats: Splats, digits: _Digits) -> np.ndarray:
     """Return the indices [V] uint32 of the drawn splats, nearest first."""
     keys, parts, count = splats.keys, splats.drawn.tolist(), splats.visible
     for k in range(digits.passes):
-        counts = np.zeros((len(parts), 1 << int(digits.width)), np.int64)
+        counts = np.zeros((len(parts), 1 << int(digits.width)), np.uint32)
         run_parallel(_count_digits, [(*part, keys, digits, k, row) for part, row in zip(parts, counts, strict=True)])
         _to_cursors(counts)
-        out = np.empty(count, np.uint32 if k == digits.passes - 1 else np.uint64)  # the last pass drops the depths
+        out = scratch((count,), np.uint32 if k == digits.passes - 1 else np.uint64)  # the last pass drops the depths
         run_parallel(
             _scatter_by_digit, [(*part, keys, digits, k, row, out) for part, row in zip(parts, counts, strict=True)]
         )
@@ -122,7 +123,7 @@ def _bin_few(
     """
     order = np.empty(count, np.uint32)
     for k in range(digits.passes):
-        counts = np.zeros((1, np.uint64(1) << digits.width), np.int64)
+        counts = np.zeros((1, np.uint64(1) << digits.width), np.uint32)
         sorted_keys = np.empty(count, np.uint64)
         parts = len(drawn) if k == 0 else 1
         for part in range(parts):
@@ -162,12 +163,12 @@ def _count_digits(start: int, stop: int, keys: np.ndarray, digits: _Digits, k: i
 @kernel
 def _to_cursors(counts: np.ndarray) -> None:
     """Replace the counts of each digit [D] in each part [P] by the position where the part writes its first."""
-    start = np.int64(0)
+    start = np.uint32(0)
     for digit in range(np.uint64(counts.shape[1])):
         for part in range(np.uint64(counts.shape[0])):
             count = counts[part, digit]
             counts[part, digit] = start
-            start += count
+            start = np.uint32(start + count)
 
 
 @kernel

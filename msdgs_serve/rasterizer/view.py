@@ -3,8 +3,6 @@
 import math
 from typing import NamedTuple, get_args
 
-import numpy as np
-
 from msdgs_serve.scene.camera import Camera, CameraModel
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.metadata import SceneMetadata
@@ -45,11 +43,14 @@ PINHOLE, ORTHOGRAPHIC, FISHEYE = range(len(get_args(CameraModel)))
 
 
 class View(NamedTuple):
-    """A camera as float64 numbers for the projection kernels."""
+    """A camera as float64 numbers for the projection kernels.
 
-    rotation: np.ndarray  # [3, 3] world to camera
-    translation: np.ndarray  # [3] world to camera
-    position: np.ndarray  # [3] in world space
+    Tuples, not arrays, whose references kernels would count for every call that takes a view, in all threads.
+    """
+
+    rotation: tuple[tuple[float, float, float], ...]  # [3][3] world to camera
+    translation: tuple[float, float, float]  # world to camera
+    position: tuple[float, float, float]  # in world space
     fx: float
     fy: float
     cx: float
@@ -65,7 +66,7 @@ class View(NamedTuple):
     min_y: float
     max_y: float
     model: int  # `PINHOLE`, `ORTHOGRAPHIC` or `FISHEYE`
-    distortion: np.ndarray  # [4] k1 to k4 of a fisheye camera
+    distortion: tuple[float, float, float, float]  # k1 to k4 of a fisheye camera
     near_plane: float
     eps2d: float
     mip: bool
@@ -78,12 +79,12 @@ def view_of(camera: Camera, options: RasterizerOptions, tiles: Region | None = N
     options out of range."""
     tiles = tiles or Region.whole(camera)
     _check(options)
-    rotation, position = np.ascontiguousarray(camera.camera_to_world[:3, :3].T), camera.position
+    rotation, position = camera.camera_to_world[:3, :3].T, camera.position
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
     return View(
-        rotation=rotation,
-        translation=-(rotation @ position),
-        position=np.ascontiguousarray(position),
+        rotation=tuple(map(tuple, rotation.tolist())),
+        translation=tuple((-(rotation @ position)).tolist()),
+        position=tuple(position.tolist()),
         fx=camera.fx,
         fy=camera.fy,
         cx=camera.cx,
@@ -97,7 +98,7 @@ def view_of(camera: Camera, options: RasterizerOptions, tiles: Region | None = N
         min_y=-camera.cy / camera.fy - margin_y,
         max_y=(camera.height - camera.cy) / camera.fy + margin_y,
         model=get_args(CameraModel).index(camera.model),
-        distortion=np.array(camera.distortion),
+        distortion=tuple(map(float, camera.distortion)),
         near_plane=float(options.near_plane),
         eps2d=float(options.eps2d),
         mip=bool(options.mip),

@@ -141,6 +141,26 @@ def test_whole_numbers(dtype: type):
 
 
 @kernel
+def appended(keys: np.ndarray, end: int, lanes: int, depths: np.ndarray, row: int) -> int:
+    return memory.append_keys(keys, end, np.uint64(lanes), memory.load(depths, 0), row)
+
+
+@DTYPES
+@pytest.mark.parametrize("lanes", [0, 1, 0x8000, 0xA5F0, 0xFFFF])
+def test_keys_of_some_lanes_follow_one_another(lanes: int, dtype: type):
+    depths = np.random.default_rng(0).uniform(0.01, 1e6, 16).astype(dtype)
+    got, want = np.full(21, 7, np.uint64), np.full(21, 7, np.uint64)
+    end = plain(appended)(want, 2, lanes, depths, 160)
+    assert appended(got, 2, lanes, depths, 160) == end == 2 + lanes.bit_count()
+    np.testing.assert_array_equal(got[:end], want[:end])
+    np.testing.assert_array_equal(got[18:], 7)
+    chosen = [k for k in range(16) if lanes >> k & 1]
+    np.testing.assert_array_equal(want[2:end] & np.uint64(0xFFFFFFFF), [160 + k for k in chosen])
+    bits = (want[2:end] >> np.uint64(32)).astype(np.uint32)
+    np.testing.assert_array_equal(bits.view(np.float32), depths[chosen].astype(np.float32))
+
+
+@kernel
 def powers(x: np.ndarray, polynomial: tuple, out: np.ndarray, logarithms: np.ndarray) -> None:
     for k in range(0, len(x), 16):
         power = exp2(memory.load(x, k), polynomial)

@@ -16,6 +16,7 @@ from msdgs_serve.rasterizer.simd.types import (
     Index,
     Vector,
     VectorType,
+    broadcast,
     first_lanes,
     is_array,
     llvm,
@@ -101,6 +102,15 @@ def store_uint16(array: np.ndarray, first_row: Index, columns: tuple[Vector, ...
     rows[:] = np.stack(columns, axis=1)[: len(rows)]
 
 
+def append_keys(keys: np.ndarray, end: int, lanes: Index, depths: Vector, first_row: Index) -> int:
+    """Write for each lane in a set of bits its depth's bits as float32 above its row's index into `keys` [n] of uint64
+    from `end`; return the new end. The 16 numbers from `end` must exist and may be overwritten."""
+    chosen = np.flatnonzero(int(lanes) >> np.arange(NUM_LANES) & 1)
+    above = depths[chosen].astype(np.float32).view(np.uint32).astype(np.uint64) << np.uint64(32)
+    keys[end : end + len(chosen)] = above | (int(first_row) + chosen).astype(np.uint64)
+    return end + len(chosen)
+
+
 typed(load, lambda array, start: VectorType(array.dtype) if is_array(array, 1) else None)
 typed(store, lambda array, start, vector: none_if(is_array(array, 1) and VectorType(array.dtype) == vector))
 typed(load_or, lambda array, start, otherwise: otherwise if is_array(array, 1) else None)
@@ -134,14 +144,32 @@ def _lower_load_or(context: Any, builder: Any, signature: Any, values: Any) -> A
 
 
 def _transposed(builder: Any, vectors: list[Any]) -> list[Any]:
-    """Return the rows of a matrix whose columns are 16 vectors, by four rounds of interleaving."""
-    lower = [lane for k in range(NUM_LANES // 2) for lane in (k, NUM_LANES + k)]
-    upper = [lane for k in range(NUM_LANES // 2, NUM_LANES) for lane in (k, NUM_LANES + k)]
-    low, high = (ir.Constant(ir.VectorType(ir.IntType(32), NUM_LANES), lanes) for lanes in (lower, upper))
-    for _ in range(4):
-        pairs = [(vectors[k], vectors[k + NUM_LANES // 2]) for k in range(NUM_LANES // 2)]
-        vectors = [builder.shuffle_vector(a, b, mask) for a, b in pairs for mask in (low, high)]
-    return vectors
+    """Return the rows of a matrix whose columns are 16 vectors: squares of 4 × 4 numbers are transposed, then put
+    together: shuffles of AVX2 cross the halves of a vector in the second half of the steps only."""
+    low, high, even, odd = (
+        [4 * quarter + k for quarter in quarters for k in range(4)]
+        for quarters in ((0, 1, 4, 5), (2, 3, 6, 7), (0, 2, 4, 6), (1, 3, 5, 7))
+    )
+    squares = [_squares_transposed(builder, vectors[k : k + 4]) for k in range(0, NUM_LANES, 4)]
+    rows = [
+        (shuffled(builder, a, b, half), shuffled(builder, c, d, half))
+        for half in (low, high)
+        for a, b, c, d in zip(*squares, strict=True)
+    ]
+    upper, lower = rows[:4], rows[4:]
+    return [shuffled(builder, *pair, lanes) for pairs in (upper, lower) for lanes in (even, odd) for pair in pairs]
+
+
+def _squares_transposed(builder: Any, v: list[Any]) -> list[Any]:
+    """Return four vectors of which number k of quarter q of result r is number r of quarter q of vector k."""
+    low, high = (
+        [lane for q in range(k, NUM_LANES, 4) for lane in (q, NUM_LANES + q, q + 1, NUM_LANES + q + 1)] for k in (0, 2)
+    )
+    v = [shuffled(builder, a, b, lanes) for lanes in (low, high) for a, b in (v[:2], v[2:])]
+    low, high = (
+        [lane for q in range(k, NUM_LANES, 4) for lane in (q, q + 1, NUM_LANES + q, NUM_LANES + q + 1)] for k in (0, 2)
+    )
+    return [shuffled(builder, a, b, lanes) for a, b in (v[:2], v[2:]) for lanes in (low, high)]
 
 
 def _rows(context: Any, builder: Any, kind: Any, array: Any, first_row: Any, first_column: Any) -> tuple[Any, Any, Any]:
@@ -245,14 +273,7 @@ def _four_columns(builder: Any, places: list[Any], real: ir.Type, first: Any) ->
     for k in range(4):
         low, high = (shuffled(builder, pieces[k + j], pieces[k + j + 4], range(8)) for j in (0, 8))
         v.append(shuffled(builder, low, high, range(16)))
-    low, high = (
-        [lane for q in range(k, NUM_LANES, 4) for lane in (q, NUM_LANES + q, q + 1, NUM_LANES + q + 1)] for k in (0, 2)
-    )
-    v = [shuffled(builder, a, b, lanes) for lanes in (low, high) for a, b in (v[:2], v[2:])]
-    low, high = (
-        [lane for q in range(k, NUM_LANES, 4) for lane in (q, q + 1, NUM_LANES + q, NUM_LANES + q + 1)] for k in (0, 2)
-    )
-    return [shuffled(builder, a, b, lanes) for a, b in (v[:2], v[2:]) for lanes in (low, high)]
+    return _squares_transposed(builder, v)
 
 
 @lower_builtin(store_columns, types.Array, types.Integer, types.Integer, types.UniTuple)
@@ -292,18 +313,41 @@ typed(store_uint16, lambda array, row, columns: none_if(array == UINT16_ROWS and
 
 @lower_builtin(store_uint16, types.Array, types.Integer, types.UniTuple)
 def _lower_store_uint16(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-    """Combine a row into one number of 64 bits, its first column lowest, as in little-endian memory."""
+    """Combine two columns into numbers of 32 bits, the first lower, as in little-endian memory, and interleave them."""
     array = context.make_array(signature.args[0])(context, builder, values[0])
     row = context.cast(builder, values[1], signature.args[1], types.intp)
     half, whole = (ir.VectorType(ir.IntType(bits), NUM_LANES) for bits in (32, 64))
-    columns = [builder.zext(builder.fptosi(v, half), whole) for v in cgutils.unpack_tuple(builder, values[2])]
-    rows = columns[0]
-    for k, column in enumerate(columns[1:], start=1):
-        rows = builder.or_(rows, builder.shl(column, ir.Constant(whole, [16 * k] * NUM_LANES)))
-    place = builder.gep(array.data, [builder.mul(row, ir.Constant(ir.IntType(64), len(columns)))])
+    left, right, top, bottom = (builder.fptosi(v, half) for v in cgutils.unpack_tuple(builder, values[2]))
+    sixteen = ir.Constant(half, [16] * NUM_LANES)
+    pairs = [builder.or_(low, builder.shl(high, sixteen)) for low, high in ((left, right), (top, bottom))]
+    rows = shuffled(builder, *pairs, [lane for k in range(NUM_LANES) for lane in (k, NUM_LANES + k)])
+    place = builder.gep(array.data, [builder.mul(row, ir.Constant(ir.IntType(64), 4))])
     exists = first_lanes(builder, builder.sub(builder.extract_value(array.shape, 0), row))
-    masked_store(builder, builder.bitcast(place, whole.as_pointer()), 2, exists, rows)
+    masked_store(builder, builder.bitcast(place, whole.as_pointer()), 2, exists, builder.bitcast(rows, whole))
     return context.get_dummy_value()
+
+
+KEYS = types.Array(types.uint64, 1, "C")
+typed(append_keys, lambda keys, end, lanes, depths, row: types.intp if keys == KEYS else None)
+
+
+@lower_builtin(append_keys, KEYS, types.Integer, types.Integer, VectorType, types.Integer)
+def _lower_append_keys(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+    """Write all 16 keys, each where the last one that counts has left off: no branch to mispredict."""
+    data = context.make_array(KEYS)(context, builder, values[0]).data
+    end, lanes, row = (context.cast(builder, values[k], signature.args[k], types.intp) for k in (1, 2, 4))
+    integers, one = ir.VectorType(ir.IntType(64), NUM_LANES), ir.Constant(ir.IntType(64), 1)
+    half, single = ir.VectorType(ir.IntType(32), NUM_LANES), ir.VectorType(ir.FloatType(), NUM_LANES)
+    depths = values[3] if values[3].type == single else builder.fptrunc(values[3], single)
+    above = builder.shl(builder.zext(builder.bitcast(depths, half), integers), ir.Constant(integers, [32] * NUM_LANES))
+    rows = builder.add(broadcast(builder, row), ir.Constant(integers, list(range(NUM_LANES))))
+    found = builder.or_(above, rows)
+    for k in range(NUM_LANES):
+        key = builder.extract_element(found, ir.Constant(ir.IntType(32), k))
+        builder.store(key, builder.gep(data, [end]))
+        bit = builder.and_(builder.lshr(lanes, ir.Constant(ir.IntType(64), k)), one)
+        end = builder.add(end, bit)
+    return end
 
 
 def prefetch(array: np.ndarray, place: Index) -> None:

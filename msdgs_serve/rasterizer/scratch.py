@@ -1,0 +1,53 @@
+"""Memory of a frame's intermediate arrays, kept for the next frame.
+
+The C library gives large arrays back to the system, which clears their pages again for each frame.
+"""
+
+import math
+import weakref
+
+import numpy as np
+import numpy.typing as npt
+
+KEPT_BYTES = 1 << 28
+"""Unused memory that is kept; the records of 4,000,000 Gaussians."""
+MAX_WASTE = 4
+"""An array may take memory of up to so many times its size."""
+CACHE_LINE_BYTES = 64
+
+_unused: dict[int, np.ndarray] = {}  # by identity, oldest first; single operations of a dict are atomic
+
+
+def scratch(shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
+    """Return an array like `np.empty`, aligned to 64 bytes, whose memory is kept for others once no array refers to
+    it."""
+    kind = np.dtype(dtype)
+    size = math.prod(shape) * kind.itemsize
+    memory = _taken(size + CACHE_LINE_BYTES)
+    # views of an array refer to it, but not to the memory below it, which has a type of its own
+    lent = np.frombuffer(memory.data, np.uint8)
+    weakref.finalize(lent, _keep, memory).atexit = False
+    start = -lent.ctypes.data % CACHE_LINE_BYTES
+    return lent[start : start + size].view(kind).reshape(shape)
+
+
+def release_scratch() -> None:
+    """Give unused memory back."""
+    _unused.clear()
+
+
+def _taken(size: int) -> np.ndarray:
+    for key, memory in list(_unused.items()):
+        if size <= memory.nbytes <= MAX_WASTE * size and _unused.pop(key, None) is not None:
+            return memory
+    return np.empty(size, np.uint8)
+
+
+def _keep(memory: np.ndarray) -> None:
+    if memory.nbytes > KEPT_BYTES:
+        return
+    _unused[id(memory)] = memory
+    excess = sum(kept.nbytes for kept in list(_unused.values())) - KEPT_BYTES
+    for key, oldest in list(_unused.items()):
+        if excess > 0 and _unused.pop(key, None) is not None:
+            excess -= oldest.nbytes
