@@ -17,7 +17,7 @@ from msdgs_serve.rasterizer.view import TILE
 from msdgs_serve.threads import run_parallel, run_serially, split_evenly, threads_to_use
 
 DIGIT_BITS = 12
-"""Bits per digit of the radix sort: counters of 16 kB, half of a level-1 cache."""
+"""Bits per digit of the radix sort: two passes sort the depths of most scenes."""
 
 SPLATS_PER_PART = 16_384
 """Fewer splats don't justify another thread."""
@@ -90,7 +90,7 @@ def _sorted_by_depth(splats: Splats, digits: _Digits) -> np.ndarray:
     """Return the indices [V] uint32 of the drawn splats, nearest first."""
     keys, parts, count = splats.keys, splats.drawn.tolist(), splats.visible
     for k in range(digits.passes):
-        counts = np.zeros((len(parts), 1 << int(digits.width)), np.uint32)
+        counts = np.zeros((len(parts), 1 << int(digits.width)), np.int64)
         run_parallel(_count_digits, [(*part, keys, digits, k, row) for part, row in zip(parts, counts, strict=True)])
         _to_cursors(counts)
         out = scratch((count,), np.uint32 if k == digits.passes - 1 else np.uint64)  # the last pass drops the depths
@@ -123,7 +123,7 @@ def _bin_few(
     """
     order = np.empty(count, np.uint32)
     for k in range(digits.passes):
-        counts = np.zeros((1, np.uint64(1) << digits.width), np.uint32)
+        counts = np.zeros((1, np.uint64(1) << digits.width), np.int64)
         sorted_keys = np.empty(count, np.uint64)
         parts = len(drawn) if k == 0 else 1
         for part in range(parts):
@@ -163,12 +163,12 @@ def _count_digits(start: int, stop: int, keys: np.ndarray, digits: _Digits, k: i
 @kernel
 def _to_cursors(counts: np.ndarray) -> None:
     """Replace the counts of each digit [D] in each part [P] by the position where the part writes its first."""
-    start = np.uint32(0)
+    start = np.int64(0)
     for digit in range(np.uint64(counts.shape[1])):
         for part in range(np.uint64(counts.shape[0])):
             count = counts[part, digit]
             counts[part, digit] = start
-            start = np.uint32(start + count)
+            start += count
 
 
 @kernel

@@ -80,6 +80,7 @@ def view_of(camera: Camera, options: RasterizerOptions, tiles: Region | None = N
     tiles = tiles or Region.whole(camera)
     _check(options)
     rotation, position = camera.camera_to_world[:3, :3].T, camera.position
+    k1, k2, k3, k4 = map(float, camera.distortion)
     margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
     return View(
         rotation=tuple(map(tuple, rotation.tolist())),
@@ -98,7 +99,7 @@ def view_of(camera: Camera, options: RasterizerOptions, tiles: Region | None = N
         min_y=-camera.cy / camera.fy - margin_y,
         max_y=(camera.height - camera.cy) / camera.fy + margin_y,
         model=get_args(CameraModel).index(camera.model),
-        distortion=tuple(map(float, camera.distortion)),
+        distortion=(k1, k2, k3, k4),
         near_plane=float(options.near_plane),
         eps2d=float(options.eps2d),
         mip=bool(options.mip),
