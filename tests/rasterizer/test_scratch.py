@@ -48,7 +48,7 @@ def test_no_more_is_kept_than_the_limit(monkeypatch: pytest.MonkeyPatch):
     while arrays:
         del arrays[0]
     assert len(module._unused) == 2
-    assert address(scratch((4_000,), np.uint8)) != last
+    assert address(scratch((4_000,), np.uint8)) == last
     assert scratch((20_000,), np.uint8).size == 20_000
     assert len(module._unused) == 2
     assert scratch((0, 16), np.float64).shape == (0, 16)
