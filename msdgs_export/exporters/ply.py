@@ -11,8 +11,13 @@ from msdgs_serve.scene.gaussians import Gaussians
 
 
 def write_ply(file: Path, gaussians: Gaussians, antialiasing: str = "dilate") -> None:
-    """Write all Gaussians in storage space: logits of opacities, log-scales, wxyz quaternions; normals are 0. A comment
-    tells `mip` anti-aliasing, as in files of Brush."""
+    """Write all Gaussians. A comment tells `mip` anti-aliasing, as in files of Brush."""
+    comments = [f"{RENDER_MODE} mip"] if antialiasing == "mip" else []
+    PlyData([PlyElement.describe(ply_rows(gaussians), "vertex")], byte_order="<", comments=comments).write(str(file))
+
+
+def ply_rows(gaussians: Gaussians) -> np.ndarray:
+    """[N] structured rows in storage space: logits of opacities, log-scales, wxyz quaternions; normals are 0."""
     rest = gaussians.sh[:, 1:].transpose(0, 2, 1).reshape(len(gaussians), -1)  # by channel
     columns = {
         **_columns("xyz", gaussians.means),
@@ -26,8 +31,7 @@ def write_ply(file: Path, gaussians: Gaussians, antialiasing: str = "dilate") ->
     rows = np.empty(len(gaussians), [(name, "<f4") for name in columns])
     for name, values in columns.items():
         rows[name] = values
-    comments = [f"{RENDER_MODE} mip"] if antialiasing == "mip" else []
-    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<", comments=comments).write(str(file))
+    return rows
 
 
 def _columns(names: str | list[str], values: np.ndarray) -> dict[str, np.ndarray]:

@@ -29,7 +29,7 @@ def far_offset(means: np.ndarray) -> np.ndarray | None:
 
 def half_side(means: np.ndarray) -> float:
     """Half the largest extent of the centers, [N, 3]."""
-    low, high = (np.quantile(means, part, axis=0) for part in ((1 - WITHIN) / 2, (1 + WITHIN) / 2))
+    low, high = np.quantile(means, ((1 - WITHIN) / 2, (1 + WITHIN) / 2), axis=0)
     return float((high - low).max()) / 2
 
 

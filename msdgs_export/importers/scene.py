@@ -10,7 +10,7 @@ import onnx
 
 from msdgs_export.bake import Baked, Moving
 from msdgs_export.importers.placement import placement
-from msdgs_export.importers.splats.base import Splats
+from msdgs_export.importers.splats.base import ROWS, Splats
 from msdgs_export.jobs.packing import stored_anew
 from msdgs_export.jobs.write import properties, set_properties, storage_differences, write_measured
 from msdgs_export.measure.poses import half_diagonal
@@ -40,11 +40,15 @@ DISTANCE = 2.2
 
 def static_scene(source: Splats, sha256: str) -> onnx.ModelProto:
     """The scene file of one set of Gaussians, in which nothing moves."""
+    return build(BASELINE, Baked(static_baked(source, sha256), Moving.none(), ()))
+
+
+def static_baked(source: Splats, sha256: str) -> BakedScene:
+    """The constants of this scene file."""
     place = placement([source.gaussians], source.offset)
     g = source.gaussians.scaled(1 / place.scale)
     metadata = metadata_of(g.means, g.sh_degree, sha256, source.antialiasing, source.dropped, source.up, place)
-    scene = BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
-    return build(BASELINE, Baked(scene, Moving.none(), ()))
+    return BakedScene(metadata, 0, g.means, g.quats, g.scales, g.opacities, g.sh).validate("the imported scene")
 
 
 def metadata_of(
@@ -115,7 +119,7 @@ def write_imported(
                 worst[name] = max(worst[name], error)
             on_time()
         storage = {} if packed is None else {"storage": storage_differences(output, packed, session)}
-        return {**worst, "against": "the files that were imported", "times": len(times), **storage}
+        return {**against_files(worst, len(times)), **storage}
 
     found = None if min_psnr is None else stored_anew(contents, min_psnr)
     packed = found and found[0]
@@ -135,21 +139,37 @@ def changed_metadata(file: Path, **changes: Any) -> None:
         temporary.write_bytes(contents.SerializeToString())
 
 
+def against_files(worst: dict[str, float], times: int) -> dict[str, Any]:
+    """What `measured_error` says of the largest differences from the imported files at some times."""
+    return {**worst, "against": "the files that were imported", "times": times}
+
+
 def _differences(session: DeformationSession, expected: Gaussians, t: float, rows: slice) -> dict[str, float]:
-    got = session.gaussians(t)
-    expected = expected.scaled(1 / session.scene.metadata.scene_to_world.scale)
-    means, quats, scales = (getattr(got, name)[rows] for name in MOVING_OUTPUTS)
-    size = half_diagonal(session.scene.metadata.bounds)
-    far = np.maximum(np.abs(expected.means.astype(np.float64)).max(axis=1, initial=0), size)
-    rotated = np.abs(to_matrix(quats.astype(np.float64)) - to_matrix(expected.quats.astype(np.float64)))
-    largest = expected.scales.max(axis=1, initial=0).astype(np.float64)
-    changes = {name: np.abs(getattr(got, name)[rows] - getattr(expected, name)) for name in session.scene.changing}
-    return {
-        "means": float((np.abs(means - expected.means).max(axis=1) / far).max(initial=0)),
-        "quats": float(rotated.max(initial=0)),
-        "scales": float((np.abs(scales - expected.scales).max(axis=1) / largest).max(initial=0)),
-        **{name: float(values.max(initial=0)) for name, values in changes.items()},
-    }
+    got, metadata = session.gaussians(t), session.scene.metadata
+    got = Gaussians(**{name: array[rows] for name, array in vars(got).items()})
+    expected = expected.scaled(1 / metadata.scene_to_world.scale)
+    changes = {name: np.abs(getattr(got, name) - getattr(expected, name)) for name in session.scene.changing}
+    worst = pose_differences(got, expected, metadata.bounds)
+    return worst | {name: float(values.max(initial=0)) for name, values in changes.items()}
+
+
+def pose_differences(got: Gaussians, expected: Gaussians, bounds: object) -> dict[str, float]:
+    """The largest differences of means, quaternions and scales, as `write_imported` stores them; of some Gaussians at
+    a time, as those in float64 would take most of the memory."""
+    size, worst = half_diagonal(bounds), dict.fromkeys(MOVING_OUTPUTS, 0.0)
+    for start in range(0, len(expected), ROWS):
+        rows = slice(start, start + ROWS)
+        means, quats, scales = (getattr(expected, name)[rows] for name in MOVING_OUTPUTS)
+        far = np.maximum(np.abs(means.astype(np.float64)).max(axis=1), size)
+        rotated = to_matrix(got.quats[rows].astype(np.float64)) - to_matrix(quats.astype(np.float64))
+        largest = scales.max(axis=1).astype(np.float64)
+        found = {
+            "means": np.abs(got.means[rows] - means).max(axis=1) / far,
+            "quats": np.abs(rotated),
+            "scales": np.abs(got.scales[rows] - scales).max(axis=1) / largest,
+        }
+        worst = {name: max(worst[name], float(values.max())) for name, values in found.items()}
+    return worst
 
 
 def digest(path: Path) -> str:

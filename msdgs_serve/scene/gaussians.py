@@ -10,6 +10,9 @@ from msdgs_serve.scene.spherical_harmonics import SH_DEGREES, sh_coefficients
 
 FloatArray = npt.NDArray[np.floating]
 
+_PART = 1 << 16
+"""Values that are checked at a time, so that checks take no memory."""
+
 
 @dataclass(frozen=True)
 class Gaussians:
@@ -48,7 +51,7 @@ class Gaussians:
         self.validate_shapes()
         n = len(self.means)
         for name in ("means", "quats", "scales", "opacities", "sh"):
-            bad = int(np.count_nonzero(~np.isfinite(getattr(self, name))))
+            bad = count_non_finite(getattr(self, name))
             if bad:
                 raise InvalidInput(f"gaussians.{name}", "finite", f"{bad} values that are NaN or infinite")
         if n and not (self.scales > 0).all():
@@ -60,3 +63,10 @@ class Gaussians:
         if n and not (np.abs(norms - 1) < 1e-3).all():
             raise InvalidInput("gaussians.quats", "unit quaternions", f"norms in [{norms.min()}, {norms.max()}]")
         return self
+
+
+def count_non_finite(array: FloatArray) -> int:
+    """Return how many values are NaN or infinite."""
+    flat = array.reshape(-1)
+    parts = (flat[start : start + _PART] for start in range(0, flat.size, _PART))
+    return sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts)

@@ -1,5 +1,6 @@
 """Read a scene file from bytes, and check all of it before any part runs."""
 
+import ctypes
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ import numpy as np
 from msdgs_serve.scene.baked import APPEARANCE, OPTIONAL_INPUT, constant_outputs
 from msdgs_serve.scene.errors import SceneFileInvalid
 from msdgs_serve.scene.foreign import START_BYTES, foreign_file
+from msdgs_serve.scene.gaussians import count_non_finite
 from msdgs_serve.scene.metadata import CONTRACT, SceneMetadata
 from msdgs_serve.scene.onnx import (
     UNLIMITED,
@@ -39,8 +41,10 @@ _INPUTS: Mapping[str, tuple[int, Shape]] = {
     "ids": (INT64, (IDS,)),
     OPTIONAL_INPUT: (FLOAT, fixed([1])),
 }
-_CHUNK_VALUES = 1 << 22
-"""Values that are checked at a time, to bound the memory of the checks."""
+_MOSTLY = 0.75
+"""Part of a file from which its constants stay in its memory."""
+_LONG_HEADER = 128
+"""Bytes of an array whose length alone takes two bytes in front of it, beside the number of its field."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ class SceneFile:
     posed: Mapping[str, tuple[int, ...]]  # outputs that depend on time, and the shape of a row of each
     outputs: tuple[str, ...]  # those of `graph` with the values of `posed`
     selected: bool  # whether rows of the outputs are those of the input `ids`; otherwise row i is of Gaussian i
-    constants: Mapping[str, np.ndarray]  # those of `constant_outputs` that are stored directly
+    constants: Mapping[str, np.ndarray]  # those of `constant_outputs` that are stored directly; unaligned views
     graph: bytes  # computes `outputs` from the inputs of the contract, which have no defaults
     constant_graph: bytes | None  # computes the remaining `constant_outputs`, without inputs
     cost: SceneCost
@@ -75,22 +79,30 @@ class SceneFile:
         """Opacities and SH, if they depend on time."""
         return tuple(name for name in self.posed if name in APPEARANCE)
 
+    def aligned_constants(self, contents: memoryview) -> dict[str, np.ndarray]:
+        """Return the constants in aligned memory. If they are most of a file whose contents may be overwritten, this is
+        theirs, and nothing else may be read from it then; otherwise copies, which don't keep the file in memory."""
+        size = sum(array.nbytes for array in self.constants.values())
+        if contents.readonly or size < _MOSTLY * len(contents):
+            return {name: array.copy() for name, array in self.constants.items()}
+        return {name: _moved(array, contents) for name, array in self.constants.items()}
+
     @property
     def computed(self) -> list[str]:
         """Names of the outputs of `constant_graph`."""
         return [name for name in constant_outputs(self.changing) if name not in self.constants]
 
 
-def read_scene_file(contents: bytes, file: str, limits: GraphLimits) -> SceneFile:
+def read_scene_file(contents: memoryview, file: str, limits: GraphLimits) -> SceneFile:
     """Read and check a scene file. Raises `SceneFileInvalid` naming `file` and the field, node or constant."""
-    if not contents:
+    if not len(contents):
         raise SceneFileInvalid(file, "file", "is empty")
     try:
         model = read_model(contents)
         metadata = SceneMetadata.from_properties(model.properties, file)
         return _read(model, metadata, limits)
     except ModelInvalid as error:
-        if other := foreign_file(contents[:START_BYTES], file):
+        if other := foreign_file(bytes(contents[:START_BYTES]), file):
             raise SceneFileInvalid(file, "file", other) from None
         raise SceneFileInvalid(file, error.field, error.problem) from None
 
@@ -114,7 +126,7 @@ def _read(model: Model, metadata: SceneMetadata, limits: GraphLimits) -> SceneFi
     for name in constant:
         stored = values[name].constant
         if stored is not None:
-            constants[name] = stored.array().copy()  # aligned, and doesn't keep the whole file in memory
+            constants[name] = stored.array()
     computed = [name for name in constant if name not in constants]
     rows = _before_selection(model, values, moving_count, tuple(posed)) if poses_all else None
     outputs = rows or tuple(posed)
@@ -169,13 +181,21 @@ def _before_selection(
     return tuple(rows)
 
 
+def _moved(array: np.ndarray, contents: memoryview) -> np.ndarray:
+    """Return an array of `contents`, moved to the next aligned place before it, over a part of its own header."""
+    whole = np.frombuffer(contents, np.uint8)
+    place = array.ctypes.data - whole.ctypes.data
+    shift = array.ctypes.data % array.itemsize
+    if not shift or array.nbytes < _LONG_HEADER:
+        return array if not shift else array.copy()
+    ctypes.memmove(array.ctypes.data - shift, array.ctypes.data, array.nbytes)
+    return whole[place - shift :][: array.nbytes].view(array.dtype).reshape(array.shape)
+
+
 def _check_finite(tensor: Tensor) -> None:
     if tensor.element != FLOAT:
         return
-    flat = tensor.array().reshape(-1)
-    parts = (flat[start : start + _CHUNK_VALUES] for start in range(0, flat.size, _CHUNK_VALUES))
-    bad = sum(int(np.count_nonzero(~np.isfinite(part))) for part in parts)
-    if bad:
+    if bad := count_non_finite(tensor.array()):
         raise ModelInvalid(tensor.name, f"holds {bad:,} values that are NaN or infinite")
 
 

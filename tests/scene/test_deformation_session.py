@@ -1,5 +1,6 @@
 """The reader of scene files: times, ids, threads and memory."""
 
+import hashlib
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,15 +12,19 @@ import pytest
 import torch
 
 from msdgs_export.bake import bake
+from msdgs_export.importers.scene import static_scene
+from msdgs_export.importers.splats.base import Splats
 from msdgs_export.plans.registry import build
 from msdgs_serve import deformation
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
 from tests.support.memory import measured
 from tests.support.models import MLP, random_model
 from tests.support.scene_files import write_scene
+from tests.support.splat_files import some_gaussians
 from tests.support.tolerances import tolerance
 
 
@@ -152,3 +157,21 @@ def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
     activation_mb = count * width * 4 / 2**20
     outputs_mb = count * 10 * 4 / 2**20
     assert grown_mb < outputs_mb + 0.25 * activation_mb
+
+
+@pytest.mark.parametrize("shift", range(4))
+def test_arrays_at_any_place_of_a_file_are_aligned_in_its_memory(tmp_path: Path, shift: int):
+    model = static_scene(Splats(some_gaussians(500, 1)), "0" * 64)
+    model.graph.name = "x" * (1 + shift)
+    contents = model.SerializeToString()
+    (tmp_path / "scene.onnx").write_bytes(contents)
+    found = DeformationSession(tmp_path / "scene.onnx")
+    copied = DeformationSession("scene.onnx", contents=contents)
+    assert found.sha256 == copied.sha256 == hashlib.sha256(contents).hexdigest()
+    for name in CONSTANT_OUTPUTS:
+        array, expected = getattr(found.scene, name), getattr(copied.scene, name)
+        np.testing.assert_array_equal(array, expected, strict=True)
+        assert array.flags.carray
+        assert not array.flags.owndata
+        assert expected.flags.owndata
+    assert contents == model.SerializeToString()

@@ -70,7 +70,7 @@ def _refuse_others(state: State, settings: dict[str, Any]) -> None:
 
 def _hyper_coords(run: RunFolder, count: int) -> torch.Tensor:
     """[N, H] of the Gaussians, from the columns `fea_…` of the point cloud."""
-    columns = Columns(run.cloud, PlyFile(run.cloud), "vertex")
+    columns = Columns.of(run.cloud, PlyFile(run.cloud), "vertex")
     if columns.count("fea_") != count:
         raise ImportFailed(run.cloud, f"has {columns.count('fea_')} of `fea_…`; its nodes have {count}")
     values = torch.from_numpy(columns.stack("fea_", count)).float()

@@ -1,7 +1,9 @@
 """The result of all readers of splat files: activated Gaussians without those that can't be drawn."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +24,9 @@ MAX_SH = 1e4
 
 MIN_LOGIT_DISTANCE = 1e-7
 """Distance of opacities from 0 and 1, which have no finite logit. No pixel of 8 bits differs by it."""
+
+ROWS = 1 << 14
+"""Gaussians that are activated at a time: their float64 arrays stay in the processor's caches."""
 
 
 @dataclass(frozen=True)
@@ -61,53 +66,74 @@ class Splats:
         return Splats(gaussians, int(arrays["dropped"]), str(arrays["antialiasing"]), warnings=warnings, **own)
 
 
+class Stored(NamedTuple):
+    """Gaussians as files store them; any dtype."""
+
+    means: np.ndarray  # [N, 3]
+    log_scales: np.ndarray  # [N, 3]
+    raw_quats: np.ndarray  # [N, 4] wxyz of any norm
+    opacities: np.ndarray  # [N] in [0, 1]
+    sh: np.ndarray  # [N, C, 3]
+    motion: np.ndarray | None = None  # [N, 15], kept as it is
+
+    def parts(self) -> Iterator["Stored"]:
+        """The same in parts of `ROWS`, at least one."""
+        for start in range(0, max(len(self.means), 1), ROWS):
+            yield Stored(*(None if array is None else array[start : start + ROWS] for array in self))
+
+
 def splats(
-    file: Path,
-    means: np.ndarray,
-    log_scales: np.ndarray,
-    raw_quats: np.ndarray,
-    opacities: np.ndarray,
-    sh: np.ndarray,
-    antialiasing: str = "dilate",
-    motion: np.ndarray | None = None,
+    file: Path, count: int, parts: Iterable[Stored], antialiasing: str = "dilate", warnings: tuple[str, ...] = ()
 ) -> Splats:
-    """Activate stored Gaussians: means [N, 3], log_scales [N, 3], raw_quats [N, 4] wxyz of any norm, opacities [N] in
-    [0, 1] and sh [N, C, 3]; `motion`, [N, 15], is kept as it is.
+    """Activate `count` stored Gaussians, part by part: float64 arrays of all together would take most of the memory.
 
     Rows with NaN, infinity, values beyond the limits above or a quaternion of norm under 1e-8 are dropped and counted;
     log-scales are clamped to ±20. Means far from the origin are moved to it: `Splats.offset`. Raises `ImportFailed` if
     no row is left.
     """
+    kept, arrays = 0, dict[str, np.ndarray]()
+    for part in parts:
+        rows = _activated(part)
+        for name, values in rows.items():
+            if name not in arrays:
+                arrays[name] = np.empty((count, *values.shape[1:]), values.dtype)
+            arrays[name][kept : kept + len(values)] = values
+        kept += len(rows["means"])
+    if not kept:
+        problem = "holds no Gaussians" if not count else f"none of its {count:,} Gaussians can be drawn"
+        raise ImportFailed(file, problem)
+    arrays = {name: values[:kept] for name, values in arrays.items()}
+    means, lengths, moving = arrays.pop("means"), arrays.pop("quat_lengths"), arrays.pop("motion", None)
+    offset = far_offset(means)
+    gaussians = Gaussians(as_float32(means if offset is None else means - offset), **arrays).validate()
+    return Splats(gaussians, count - kept, antialiasing, lengths, warnings, offset=offset, motion=moving)
+
+
+def _activated(stored: Stored) -> dict[str, np.ndarray]:
+    """The rows that can be drawn: means in float64, everything else as in `Splats`."""
     with np.errstate(over="ignore", invalid="ignore"):
-        norms = np.linalg.norm(raw_quats.astype(np.float64), axis=1)
+        norms = np.linalg.norm(stored.raw_quats.astype(np.float64), axis=1)
         good = (
-            (np.abs(means) <= MAX_DISTANCE).all(axis=1)
-            & ~np.isnan(log_scales).any(axis=1)
+            (np.abs(stored.means) <= MAX_DISTANCE).all(axis=1)
+            & ~np.isnan(stored.log_scales).any(axis=1)
             & (norms >= MIN_NORM)
             & np.isfinite(norms)
-            & ~np.isnan(opacities)
-            & (np.abs(sh) <= MAX_SH).all(axis=(1, 2))
+            & ~np.isnan(stored.opacities)
+            & (np.abs(stored.sh) <= MAX_SH).all(axis=(1, 2))
         )
-        if motion is not None:
-            good &= (np.abs(motion) <= MAX_DISTANCE).all(axis=1)
-    count = int(good.sum())
-    if not count:
-        problem = "holds no Gaussians" if not len(good) else f"none of its {len(good):,} Gaussians can be drawn"
-        raise ImportFailed(file, problem)
-    rows = slice(None) if count == len(good) else good
-    centers = means[rows].astype(np.float64)
-    offset = far_offset(centers)
-    scales = np.exp(log_scales[rows].astype(np.float64).clip(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))
-    gaussians = Gaussians(
-        as_float32(centers if offset is None else centers - offset),
-        as_float32(raw_quats[rows] / norms[rows, None]),
-        as_float32(scales),
-        as_float32(opacities[rows].clip(0, 1)),
-        as_float32(sh[rows]),
-    )
-    moving = None if motion is None else as_float32(motion[rows])
-    lengths = as_float32(norms[rows])
-    return Splats(gaussians.validate(), len(good) - count, antialiasing, lengths, offset=offset, motion=moving)
+        if stored.motion is not None:
+            good &= (np.abs(stored.motion) <= MAX_DISTANCE).all(axis=1)
+    rows = slice(None) if good.all() else good
+    log_scales = stored.log_scales[rows].astype(np.float64)
+    found = {
+        "means": stored.means[rows].astype(np.float64),
+        "quats": as_float32(stored.raw_quats[rows] / norms[rows, None]),
+        "scales": as_float32(np.exp(log_scales.clip(-LOG_SCALE_LIMIT, LOG_SCALE_LIMIT))),
+        "opacities": as_float32(stored.opacities[rows].clip(0, 1)),
+        "sh": as_float32(stored.sh[rows]),
+        "quat_lengths": as_float32(norms[rows]),
+    }
+    return found if stored.motion is None else {**found, "motion": as_float32(stored.motion[rows])}
 
 
 def sigmoid(raw_opacities: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed
-from msdgs_export.importers.splats.base import Splats, smallest_three, splats
+from msdgs_export.importers.splats.base import Splats, Stored, smallest_three, splats
 from msdgs_export.importers.splats.ply_columns import Columns, rest_of
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 
@@ -41,14 +41,14 @@ def compressed(file: Path, vertex: Columns, chunk: Columns | None, bands: Column
         if bands.rows != vertex.rows:
             raise ImportFailed(file, f"has {bands.rows:,} rows of `sh` for {vertex.rows:,} Gaussians")
         sh = np.concatenate([sh, rest_of(file, bands, lambda name: _byte_sh(bands.read(name)))], axis=1)
-    return splats(
-        file,
+    stored = Stored(
         within("min_xyz", "max_xyz", _bits(vertex.packed("packed_position"), *ELEVEN)),
         within("min_scale_xyz", "max_scale_xyz", _bits(vertex.packed("packed_scale"), *ELEVEN)),
         smallest_three(small, packed >> 30),
         colors[:, 3],
         sh,
     )
+    return splats(file, vertex.rows, stored.parts())
 
 
 def _bits(packed: np.ndarray, *fields: tuple[int, int]) -> np.ndarray:

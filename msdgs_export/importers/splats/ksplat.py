@@ -1,14 +1,14 @@
 """`.ksplat` 0.1, the format of mkkellogg's viewer: a header, headers of sections, and Gaussians in buckets."""
 
 import struct
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed, cut_off
-from msdgs_export.importers.splats.base import Splats, splats
+from msdgs_export.importers.splats.base import Splats, Stored, splats
 from msdgs_serve.scene.fields import FieldTable
 from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
 
@@ -86,16 +86,6 @@ class Section(NamedTuple):
     sh_degree: int
 
 
-class Arrays(NamedTuple):
-    """What `splats` is given."""
-
-    means: np.ndarray  # [n, 3]
-    log_scales: np.ndarray  # [n, 3]
-    raw_quats: np.ndarray  # [n, 4] wxyz
-    opacities: np.ndarray  # [n]
-    sh: np.ndarray  # [n, C, 3]
-
-
 def read_ksplat(file: Path) -> Splats:
     """The Gaussians of a `.ksplat` file of compression level 0, 1 or 2. Raises `ImportFailed`."""
     contents = file.read_bytes()
@@ -110,7 +100,7 @@ def read_ksplat(file: Path) -> Splats:
     if data > len(contents):
         raise cut_off(file, f"the headers of {header.max_sections:,} sections", data, len(contents))
     is_defined = not any(contents[2:4]) and not any(contents[HEADER.size : HEADER_BYTES])
-    parts: list[Arrays] = []
+    parts: list[Stored] = []
     for number in range(header.max_sections):
         at = HEADER_BYTES + SECTION_BYTES * number
         is_defined &= not any(contents[at + SECTION.size : at + SECTION_BYTES])
@@ -123,7 +113,7 @@ def read_ksplat(file: Path) -> Splats:
     if not parts or found != header.count:
         raise ImportFailed(file, f"states {header.count:,} Gaussians; its {len(parts):,} sections have {found:,}")
     warning = "it has bytes that version 0.1 doesn't define; they are left out"
-    return replace(splats(file, *_together(parts)), warnings=() if is_defined else (warning,))
+    return splats(file, found, _of_one_degree(parts), warnings=() if is_defined else (warning,))
 
 
 def _record(level: int, sh_degree: int) -> np.dtype:
@@ -157,7 +147,7 @@ def _end(file: Path, level: int, section: Section, contents: bytes, start: int) 
     return start + size
 
 
-def _decoded(file: Path, header: Header, section: Section, contents: bytes, start: int) -> Arrays:
+def _decoded(file: Path, header: Header, section: Section, contents: bytes, start: int) -> Stored:
     """The Gaussians of one section."""
     skipped = 4 * section.partial_buckets + BUCKET_BYTES * section.buckets
     rows = np.frombuffer(contents, _record(header.level, section.sh_degree), section.count, start + skipped)
@@ -176,7 +166,7 @@ def _decoded(file: Path, header: Header, section: Section, contents: bytes, star
     ]
     dc = (rgba[:, None, :3] - 0.5) / SH_C0
     log_scales = np.log(rows["scales"].astype(np.float64))
-    return Arrays(means, log_scales, rows["quats"], rgba[:, 3], np.concatenate([dc, *bands], axis=1))
+    return Stored(means, log_scales, rows["quats"], rgba[:, 3], np.concatenate([dc, *bands], axis=1))
 
 
 def _centers(file: Path, section: Section, contents: bytes, start: int) -> np.ndarray:
@@ -192,8 +182,9 @@ def _centers(file: Path, section: Section, contents: bytes, start: int) -> np.nd
     return centers[np.searchsorted(ends, np.arange(section.count), side="right")]
 
 
-def _together(parts: list[Arrays]) -> Arrays:
-    """The sections' arrays one after the other; SH that a section doesn't have are 0."""
-    widest = max(part.sh.shape[1] for part in parts)
-    padded = [part._replace(sh=np.pad(part.sh, ((0, 0), (0, widest - part.sh.shape[1]), (0, 0)))) for part in parts]
-    return Arrays(*(np.concatenate(arrays) for arrays in zip(*padded, strict=True)))
+def _of_one_degree(sections: list[Stored]) -> Iterator[Stored]:
+    """The sections in parts; SH that a section doesn't have are 0."""
+    widest = max(section.sh.shape[1] for section in sections)
+    for section in sections:
+        for part in section.parts():
+            yield part._replace(sh=np.pad(part.sh, ((0, 0), (0, widest - part.sh.shape[1]), (0, 0))))

@@ -12,7 +12,7 @@ import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_export.importers.splats.axes import up_direction
-from msdgs_export.importers.splats.base import LOG_SCALE_LIMIT, Splats, sigmoid, splats
+from msdgs_export.importers.splats.base import LOG_SCALE_LIMIT, ROWS, Splats, Stored, sigmoid, splats
 from msdgs_export.importers.splats.compressed_ply import compressed
 from msdgs_export.importers.splats.ply_columns import Columns, rest_of
 from msdgs_export.importers.splats.ply_fields import checked_fields
@@ -38,16 +38,16 @@ def read_ply(file: Path) -> Splats:
         contents = PlyFile(file)
     except PlyInvalid as error:
         raise ImportFailed(file, str(error)) from None
-    columns = {"vertex": Columns(file, contents, "vertex")}
+    columns = {"vertex": Columns.of(file, contents, "vertex")}
     vertex = columns["vertex"]
     if vertex.has("packed_position"):
-        columns |= {name: Columns(file, contents, name) for name in ("chunk", "sh") if contents.element(name)}
+        columns |= {name: Columns.of(file, contents, name) for name in ("chunk", "sh") if contents.element(name)}
     others = [each.name for each in contents.elements if each.count and each.name not in columns]
     warnings = checked_fields(file, [name for each in columns.values() for name in each.names] + others)
     if vertex.has("packed_position"):
         found = compressed(file, vertex, columns.get("chunk"), columns.get("sh"))
     else:
-        found = _gaussians(file, vertex)
+        found = splats(file, vertex.rows, (_stored(file, part) for part in vertex.parts(ROWS)))
         warnings += [] if vertex.has("scale_2") else [SURFELS]
     up, unknown = _up(contents.comments)
     return replace(found, antialiasing=_antialiasing(contents.comments), up=up, warnings=(*warnings, *unknown))
@@ -78,7 +78,7 @@ def _up(comments: Sequence[str]) -> tuple[np.ndarray | None, list[str]]:
     return None, [f"its header names the vertical axis {said[-1]!r}, no axis such as z or -y; --up says which is up"]
 
 
-def _gaussians(file: Path, columns: Columns) -> Splats:
+def _stored(file: Path, columns: Columns) -> Stored:
     moves = is_spacetime(columns)
     rest = rest_of(file, columns, columns.read)
     sh = np.concatenate([_dc(columns, moves and not rest.size)[:, None], rest], axis=1)
@@ -89,15 +89,8 @@ def _gaussians(file: Path, columns: Columns) -> Splats:
     if columns.has("filter_3D"):
         opacities, log_scales = _filtered(opacities, log_scales, columns.read("filter_3D"))
     quats = columns.stack("rot_", 4)
-    return splats(
-        file,
-        columns.named("x", "y", "z"),
-        log_scales,
-        quats,
-        opacities,
-        sh,
-        motion=motion_of(file, columns, quats) if moves else None,
-    )
+    motion = motion_of(file, columns, quats) if moves else None
+    return Stored(columns.named("x", "y", "z"), log_scales, quats, opacities, sh, motion)
 
 
 def _dc(columns: Columns, is_color: bool) -> np.ndarray:

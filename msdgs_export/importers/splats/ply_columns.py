@@ -1,7 +1,7 @@
 """The properties of an element of a PLY by name."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +15,34 @@ PREFIX = re.compile(r"(scalar_)+", re.IGNORECASE)
 
 
 class Columns:
-    """The properties of one element. Raises `ImportFailed`, also for a property that is missing when it is read."""
+    """The properties of one element. Raises `ImportFailed` for a property that is missing when it is read."""
 
-    def __init__(self, file: Path, contents: PlyFile, element: str) -> None:
-        try:
-            self._data = contents.read(element)
-        except PlyInvalid as error:
-            raise ImportFailed(file, str(error)) from None
-        self._file, self._element = file, element
-        stored = self._data.dtype.names or ()
+    def __init__(self, file: Path, element: str, data: np.ndarray) -> None:
+        self._file, self._element, self._data = file, element, data
+        stored = data.dtype.names or ()
         plain = {each: PREFIX.sub("", each, count=1) if PREFIX.match(each) else each for each in stored}
         self._stored = {name: each for each, name in plain.items()} | {
             each: each for each in stored if plain[each] == each
         }
-        self.rows = len(self._data)
+        self.rows = len(data)
+
+    @classmethod
+    def of(cls, file: Path, contents: PlyFile, element: str) -> "Columns":
+        """The properties of an element of a file. Raises `ImportFailed`."""
+        try:
+            return cls(file, element, contents.read(element))
+        except PlyInvalid as error:
+            raise ImportFailed(file, str(error)) from None
+
+    def parts(self, rows: int) -> Iterator["Columns"]:
+        """The same in parts of so many rows, at least one. Each part of a mapped file is mapped anew: pages that were
+        read count as memory of the process until they are unmapped."""
+        for start in range(0, max(self.rows, 1), rows):
+            data = self._data[start : start + rows]
+            if isinstance(self._data, np.memmap):
+                at = self._data.offset + start * data.itemsize
+                data = np.memmap(self._file, data.dtype, "r", at, data.shape)
+            yield Columns(self._file, self._element, data)
 
     @property
     def names(self) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed
-from msdgs_export.importers.splats.base import Splats, smallest_three, splats
+from msdgs_export.importers.splats.base import Splats, Stored, smallest_three, splats
 from msdgs_export.importers.splats.webp import read_texture
 from msdgs_serve.scene.fields import FieldTable
 
@@ -201,8 +201,8 @@ def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
     scales = meta.numbers("scales.codebook", 256)[scales]
     antialiasing, warnings = _model(meta)
     warnings += [f"{META} has `{name}`, which isn't known and is left out" for name in FIELDS.unlisted(meta.names())]
-    made = splats(path, means, scales, _quats(quats), colors[:, 3] / 255, sh, antialiasing)
-    return replace(made, warnings=tuple(warnings))
+    stored = Stored(means, scales, _quats(quats), colors[:, 3] / 255, sh)
+    return splats(path, len(means), stored.parts(), antialiasing, tuple(warnings))
 
 
 def _model(meta: _Meta) -> tuple[str, list[str]]:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed
-from msdgs_export.importers.splats.base import Splats, splats
+from msdgs_export.importers.splats.base import Splats, Stored, splats
 from msdgs_serve.scene.fields import FieldTable
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 
@@ -29,4 +29,5 @@ def read_splat(file: Path) -> Splats:
     quats = (records["quats"].astype(np.float64) - 128) / 128
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(records["scales"].astype(np.float64))
-    return splats(file, records["means"], log_scales, quats, rgba[:, 3], ((rgba[:, :3] - 0.5) / SH_C0)[:, None])
+    dc = ((rgba[:, :3] - 0.5) / SH_C0)[:, None]
+    return splats(file, len(records), Stored(records["means"], log_scales, quats, rgba[:, 3], dc).parts())

@@ -8,7 +8,7 @@ import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed, cut_off
 from msdgs_export.importers.splats.axes import from_right_up_back
-from msdgs_export.importers.splats.base import Splats, smallest_three, splats
+from msdgs_export.importers.splats.base import Splats, Stored, smallest_three, splats
 from msdgs_export.importers.splats.coordinate_systems import MISNAMED, SYSTEMS, from_system
 from msdgs_export.importers.splats.spz_container import (
     EXTENSIONS,
@@ -123,7 +123,8 @@ def _decoded(file: Path, found: Container, leaves: np.ndarray | None, system: st
         means, quats, sh = from_right_up_back(means, quats, sh)
     elif system is not None:
         means, quats, sh = from_system(system, means, quats, sh)
-    return splats(file, means, log_scales, quats, opacities, sh, "mip" if header.flags & MIP else "dilate")
+    stored = Stored(means, log_scales, quats, opacities, sh)
+    return splats(file, len(means), stored.parts(), "mip" if header.flags & MIP else "dilate")
 
 
 def _quats(header: Header, rotations: np.ndarray) -> np.ndarray:
