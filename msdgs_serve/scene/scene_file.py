@@ -93,7 +93,7 @@ class SceneFile:
         return [name for name in constant_outputs(self.changing) if name not in self.constants]
 
 
-def read_scene_file(contents: memoryview, file: str, limits: GraphLimits) -> SceneFile:
+def read_scene_file(contents: bytes | memoryview, file: str, limits: GraphLimits) -> SceneFile:
     """Read and check a scene file. Raises `SceneFileInvalid` naming `file` and the field, node or constant."""
     if not len(contents):
         raise SceneFileInvalid(file, "file", "is empty")
