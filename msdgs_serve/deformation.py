@@ -164,7 +164,7 @@ class DeformationSession:
     def _read(self) -> memoryview:
         try:
             with self.path.open("rb") as file:
-                contents = memoryview(np.empty(os.fstat(file.fileno()).st_size, np.uint8))
+                contents = np.empty(os.fstat(file.fileno()).st_size, np.uint8).data
                 return contents[: file.readinto(contents)]
         except OSError as error:
             raise SceneFileInvalid(self._file, "file", f"can't be read: {error.strerror or error}") from error

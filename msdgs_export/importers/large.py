@@ -31,7 +31,8 @@ class LargeScene:
         for output in self._message.graph.output:
             if output.name in self._arrays:
                 output.type.tensor_type.shape.dim[0].dim_value = len(scene)
-        self._posed = Gaussians(*scene.static, none["opacities"], none["sh"])
+        posed = (scene.static_means, scene.static_quats, scene.static_scales)
+        self._posed = Gaussians(*posed, none["opacities"], none["sh"])
 
     def write(self, output: Path) -> BakedScene:
         """Write the scene file as `write_imported` does, in float32. It can be written once: opacities and SH are

@@ -156,7 +156,8 @@ def _differences(session: DeformationSession, expected: Gaussians, t: float, row
 def pose_differences(got: Gaussians, expected: Gaussians, bounds: object) -> dict[str, float]:
     """The largest differences of means, quaternions and scales, as `write_imported` stores them; of some Gaussians at
     a time, as those in float64 would take most of the memory."""
-    size, worst = half_diagonal(bounds), dict.fromkeys(MOVING_OUTPUTS, 0.0)
+    size = half_diagonal(bounds)
+    worst: dict[str, float] = dict.fromkeys(MOVING_OUTPUTS, 0.0)
     for start in range(0, len(expected), ROWS):
         rows = slice(start, start + ROWS)
         means, quats, scales = (getattr(expected, name)[rows] for name in MOVING_OUTPUTS)

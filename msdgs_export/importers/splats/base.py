@@ -79,7 +79,10 @@ class Stored(NamedTuple):
     def parts(self) -> Iterator["Stored"]:
         """The same in parts of `ROWS`, at least one."""
         for start in range(0, max(len(self.means), 1), ROWS):
-            yield Stored(*(None if array is None else array[start : start + ROWS] for array in self))
+            rows = slice(start, start + ROWS)
+            motion = None if self.motion is None else self.motion[rows]
+            posed = (self.means[rows], self.log_scales[rows], self.raw_quats[rows])
+            yield Stored(*posed, self.opacities[rows], self.sh[rows], motion)
 
 
 def splats(
