@@ -48,7 +48,7 @@ class BodiesExport:
 
 def _motions(graph: GraphBuilder, name: str, layer: BodiesLayer, time: str) -> str:
     """[bodies, 16] `BodiesLayer.motions`, but matrices column by column."""
-    curves = [to_numpy(layer.size * layer.transls), to_numpy(layer.rots)]
+    curves = [to_numpy(layer.transls), to_numpy(layer.rots)]
     poses = curves_at(graph, name, layer, curves, time)
     transls, raw = graph.split(poses, [f"{name}.transls", f"{name}.raw_rots"], [3, 4])
     rots = unit_rows(graph, f"{name}.rots", raw)

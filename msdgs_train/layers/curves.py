@@ -61,6 +61,11 @@ class CurveLayer(DeformationLayer):
         """Those that are constant beyond the time window: all but rotations."""
         return (self.transls,)
 
+    @property
+    def rot_lengths(self) -> float | Tensor:
+        """Lengths of the quaternions of new knots, one or [C, 1]."""
+        return 1.0
+
     def values_at(self, t: Tensor, *curves: Tensor) -> list[Tensor]:
         """[C, ·] of curves, [knots + 3, C, ·], at one time."""
         read, part = self.knots_at(t)
@@ -99,9 +104,9 @@ class CurveLayer(DeformationLayer):
             rots = [rot := unit(multiply(step, rot)) for _ in turned]
             for curve in self.held_curves:
                 curve[beyond] = curve[last]
-            self.rots[beyond] = rot
+            self.rots[beyond] = self.rot_lengths * rot
             for k, each in zip(turned, rots, strict=True):
-                self.rots[k] = each
+                self.rots[k] = self.rot_lengths * each
 
 
 def cubic_weights(part: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Quaternions [N, 4], wxyz, and symmetric matrices, differentiable."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from msdgs_serve.scene.quaternion import MIN_NORM
+from msdgs_serve.scene.quaternion import MIN_NORM, to_matrix
 from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.quaternion_kernels import unit_backward, unit_forward
@@ -70,13 +71,19 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """[N, 3, 3] of unit quaternions."""
-    w, x, y, z = quats.unbind(dim=1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    products = (quats[:, :, None] * quats[:, None]).flatten(1)
+    identity = torch.eye(3, dtype=quats.dtype, device=quats.device).flatten()
+    return torch.addmm(identity, products, _product_terms(quats.dtype, quats.device)).unflatten(1, (3, 3))
+
+
+@cache
+def _product_terms(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """[16, 9] what each product of two components adds to a rotation matrix: half of what both orders of it do."""
+    units = np.eye(4)
+    alone = to_matrix(units) - np.eye(3)
+    sums = to_matrix((units[:, None] + units).reshape(16, 4)) - np.eye(3)
+    terms = (sums.reshape(4, 4, 9) - alone.reshape(4, 1, 9) - alone.reshape(4, 9)) / 2
+    return torch.from_numpy(terms.reshape(16, 9)).to(device, dtype)
 
 
 def stretch_matrices(stretches: Tensor) -> Tensor:

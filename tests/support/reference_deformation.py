@@ -113,7 +113,7 @@ def plain_bodies(layer: BodiesLayer, means: np.ndarray, t: float) -> PlainDeltas
     for m, mean in enumerate(means):
         weights = np.exp(logits[m]) / np.exp(logits[m]).sum()
         for weight, pose, center in zip(weights, poses, centers, strict=True):
-            moved = rotation(pose[3:]).apply(mean - center) + center + float(layer.size) * pose[:3]
+            moved = rotation(pose[3:]).apply(mean - center) + center + pose[:3]
             shifts[m] += weight * (moved - mean)
             turns[m] += weight * (pose[3:] / np.linalg.norm(pose[3:]) - [1, 0, 0, 0])
     return PlainDeltas(shifts, np.zeros((len(means), 3)), turns)

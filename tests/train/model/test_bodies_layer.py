@@ -1,4 +1,4 @@
-"""Bodies: what nodes do that follow them, where they are placed, and what doesn't depend on the size of a scene."""
+"""Bodies: what nodes do that follow them, where they are placed, and what doesn't depend on their size."""
 
 from dataclasses import replace
 
@@ -75,15 +75,25 @@ def test_bodies_at_rest_move_nothing_at_all() -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-2, 30.0])
-def test_motions_scale_with_the_scene(factor: float) -> None:
-    """So that equal steps of the optimizer move a small scene as much in proportion."""
-    nodes = normal(9, 20, 3)
-    one, other = layer_of(nodes), layer_of(factor * nodes)
-    assert_close(other.weights().detach(), one.weights().detach().numpy(), "rotation")
-    got, want = other(factor * nodes, time(3.1)), one(nodes, time(3.1))
-    assert_close(got.delta_means.detach() / factor, want.delta_means.detach().numpy(), "rotation")
-    smooth = [each.regularizers(nodes, time(3.1), torch.Generator())["body_smoothness"] for each in (one, other)]
-    assert_close(smooth[1].detach(), smooth[0].detach().numpy(), "rotation")
+def test_changes_of_poses_have_the_same_effect_in_scenes_of_any_size(factor: float) -> None:
+    nodes, shifts, found = normal(9, 20, 3), normal(8, 20, 3), []
+    for places in (nodes, factor * nodes):
+        layer = layer_of(places, noise=0.0)
+        assert (layer.rots.norm(dim=2) == layer.sizes).all()
+        moved = (layer(places, time(3.1)).delta_means * shifts).sum()
+        found.append([*torch.autograd.grad(moved, (layer.transls, layer.rots)), layer.weights().detach()])
+    for got, want in zip(*found, strict=True):
+        assert_close(got, want.numpy(), "rotation")
+    assert bool(found[0][1].any())
+
+
+def test_bodies_are_as_large_as_the_nodes_near_them_are_far() -> None:
+    spread = torch.tensor([1.0, 2.0])
+    nodes = torch.cat([size * normal(k, 50, 3) + 40 * k for k, size in enumerate(spread)])
+    layer = layer_of(nodes, replace(CONFIG, num_bodies=2), noise=0.0)
+    order = layer.centers[:, 0].argsort()
+    distances = [(nodes[part] - nodes[part].mean(dim=0)).norm(dim=1).mean() for part in (slice(50), slice(50, None))]
+    assert_close(layer.sizes[order], 2 * torch.stack(distances).numpy(), "rotation")
 
 
 def test_centers_are_the_means_of_the_nearest() -> None:
