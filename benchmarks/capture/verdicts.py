@@ -28,7 +28,16 @@ from tests.support.camera_moves import arc, pan, tripod
 from tests.support.clips import clip_of_poses
 
 FRAMES = 24
-FIGURES = ("registered", "parallax", "baseline", "reprojection_error", "beyond_rotation", "seen", "moving")
+FIGURES = (
+    "registered",
+    "parallax",
+    "baseline",
+    "reprojection_error",
+    "beyond_rotation",
+    "agreement",
+    "seen",
+    "moving",
+)
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,8 @@ class Measures:
     """Pixels of the motion between frames of one camera that no rotation explains."""
     moving: float = 0.0
     """Mean share of a frame that moves."""
+    agreement: float = 1.0
+    """Observations of points, relative to the features that are found again in several frames; may be above 1."""
     breaks: tuple[float, ...] = ()
     """Seconds at which a stretch of frames with poses borders on one without, as at a cut."""
 
@@ -89,6 +91,7 @@ def measure_poses(measures: Measures, frames: FrameSet, poses: Poses, moving: Ma
         other_models=model.others,
         method=model.method,
         beyond_rotation=model.beyond_rotation,
+        agreement=model.agreement,
         moving=float(np.mean(list(moving.values()))) if moving else 0.0,
         breaks=_breaks(frames, set(poses.registered)),
     )

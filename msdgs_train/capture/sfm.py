@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from msdgs_train.capture.rotation import Pair, beyond_rotation
+from msdgs_train.capture.sfm_agreement import agreement, motion_beyond_rotation
 from msdgs_train.capture.sfm_fixed import of_fixed_cameras
 from msdgs_train.capture.sfm_mapping import STATIC, mapped, refined
 from msdgs_train.capture.sfm_matching import extract, match, only_fixed
@@ -25,8 +25,6 @@ from msdgs_train.capture.sfm_process import CameraViews, PosesJob, UndistortedJo
 from msdgs_train.capture.sfm_report import start_reports
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 
-MIN_MATCHES = 30
-"""Of a pair of images that tells whether the camera only turned."""
 WARNINGS_ONLY = 2
 
 
@@ -55,8 +53,6 @@ def find(job: PosesJob) -> None:
     extract(job, database)
     match(job, database)
     models, method = mapped(job, database)
-    static = workspace / STATIC
-    turned = _beyond_rotation(static if static.exists() else database)
     if only_fixed(job):
         models, method = of_fixed_cameras(job, database, (models, method))
     elif models:
@@ -69,7 +65,9 @@ def find(job: PosesJob) -> None:
     sparse.mkdir()
     largest.write(sparse)
     sizes = [model.num_reg_images() for model in models]
-    summary(largest, method, sizes[1:], turned).save(workspace / GEOMETRY)
+    static = workspace / STATIC
+    turned = motion_beyond_rotation(largest, job.pairs, static if static.exists() else database)
+    summary(largest, method, sizes[1:], turned, agreement(largest, database)).save(workspace / GEOMETRY)
     for each in workspace.glob("*.db"):
         each.unlink()
 
@@ -94,7 +92,9 @@ def _spread_to_frames(model: pycolmap.Reconstruction, cameras: Sequence[CameraVi
             model.add_image_with_trivial_frame(copy, image.cam_from_world())
 
 
-def summary(model: pycolmap.Reconstruction, method: str, others: list[int], beyond_rotation: float) -> Summary:
+def summary(
+    model: pycolmap.Reconstruction, method: str, others: list[int], beyond_rotation: float, agreement: float
+) -> Summary:
     """What `sparse_model` keeps of a model."""
     images = sorted((model.image(image_id) for image_id in model.reg_image_ids()), key=lambda image: image.name)
     ids = sorted(model.points3D)
@@ -117,6 +117,7 @@ def summary(model: pycolmap.Reconstruction, method: str, others: list[int], beyo
         method=method,
         others=tuple(others),
         beyond_rotation=beyond_rotation,
+        agreement=agreement,
     )
 
 
@@ -137,27 +138,6 @@ def write_undistorted(job: UndistortedJob) -> None:
         camera.width, camera.height = pinhole.width, pinhole.height
     Path(job.out).mkdir(parents=True, exist_ok=True)
     model.write(job.out)
-
-
-def _beyond_rotation(database: Path) -> float:
-    """Displacement that no rotation of the camera explains, of matches of pairs of one camera's images, in pixels."""
-    with pycolmap.Database.open(database) as opened:
-        images = {image.image_id: image for image in opened.read_all_images()}
-        cameras = {camera.camera_id: camera for camera in opened.read_all_cameras()}
-        pairs, long_side = [], 1
-        for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
-            one, other = pycolmap.pair_id_to_image_pair(key)
-            camera = cameras[images[one].camera_id]
-            if images[one].camera_id != images[other].camera_id or len(geometry.inlier_matches) < MIN_MATCHES:
-                continue
-            long_side = max(camera.width, camera.height)
-            middle = np.array([camera.width, camera.height]) / 2
-            places = [
-                (opened.read_keypoints(image)[rows, :2] - middle) / long_side
-                for image, rows in zip((one, other), geometry.inlier_matches.T, strict=True)
-            ]
-            pairs.append(Pair(*places))
-    return long_side * beyond_rotation(pairs)
 
 
 def _exit_with_parent() -> None:

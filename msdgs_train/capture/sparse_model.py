@@ -26,6 +26,7 @@ class Summary:
     method: str  # "incremental" or "global"
     others: tuple[int, ...]  # images of the other models
     beyond_rotation: float  # pixels of the motion between images that no rotation of the camera explains
+    agreement: float  # observations relative to the features that are found again in several images
 
     def save(self, file: Path) -> None:
         """Write it as NPZ."""
@@ -37,9 +38,9 @@ class Summary:
         """Read what `save` wrote."""
         with np.load(file) as stored:
             arrays = {field.name: stored[field.name] for field in fields(Summary)}
+        numbers = {name: float(arrays[name]) for name in ("error", "beyond_rotation", "agreement")}
         others = tuple(int(size) for size in arrays["others"])
-        scalars = {"error": float(arrays["error"]), "method": str(arrays["method"]), "others": others}
-        return Summary(**{**arrays, **scalars, "beyond_rotation": float(arrays["beyond_rotation"])})
+        return Summary(**{**arrays, **numbers, "method": str(arrays["method"]), "others": others})
 
     @property
     def centers(self) -> np.ndarray:

@@ -18,8 +18,11 @@ MIN_REGISTERED, FEW_REGISTERED = 0.5, 0.95
 """Shares of frames with poses."""
 MIN_WHOLE = 0.75
 """The same, where poses break off."""
-MIN_BEYOND_ROTATION = 1 / 1000
-"""In longer sides of the frames; half a pixel at least, as matches are no better."""
+MIN_BEYOND_ROTATION, LEAST_PIXELS = 1 / 1000, 0.65
+"""In longer sides of the frames, and in pixels at least, as matches are no better."""
+MIN_AGREEMENT = 0.4
+"""Of the features that are found again, as observations of points: 1.0 and more with right poses, and 0.3 at most with
+wrong ones."""
 MIN_SEEN = 15
 """Points that a frame sees, for poses that are more than guesses."""
 MIN_PARALLAX, LITTLE_PARALLAX = 1.0, 4.0
@@ -30,6 +33,8 @@ MUCH_MOVING = 0.5
 """Share of the image."""
 LARGE_ERROR = 1.5
 """Pixels."""
+ENOUGH_FIXED = 4
+"""Cameras, if all stand still: of three, centers are found with errors of 3 to 27 % of their extent."""
 
 MOVE = "walk around the subject, so that the camera itself moves sideways, by 20° or more as the subject sees it"
 
@@ -114,7 +119,7 @@ def _without_parallax(measures: Measures) -> Iterator[Finding]:
 
 
 def _only_turned(measures: Measures) -> bool:
-    return measures.beyond_rotation < max(MIN_BEYOND_ROTATION * measures.size, 0.5)
+    return measures.beyond_rotation < max(MIN_BEYOND_ROTATION * measures.size, LEAST_PIXELS)
 
 
 def _without_poses(measures: Measures) -> Iterator[Finding]:
@@ -130,6 +135,9 @@ def _without_poses(measures: Measures) -> Iterator[Finding]:
         yield Finding(found, CLOSER if measures.fixed else TEXTURE, prevents=True)
     elif measures.seen < MIN_SEEN:
         yield Finding(f"a frame sees {measures.seen:.0f} points that poses agree on, which is too few", TEXTURE, True)
+    elif measures.agreement < MIN_AGREEMENT:
+        few = f"poses agree with {measures.agreement:.0%} of what frames have in common, so that they are wrong"
+        yield Finding(few, "keep more of what stands still in view, and move slower", prevents=True)
     elif measures.parallax < MIN_PARALLAX:
         yield Finding(f"the parallax of {measures.parallax:.1f}° is too little", MOVE, prevents=True)
 
@@ -138,6 +146,9 @@ def _improvable(measures: Measures) -> Iterator[Finding]:
     if measures.registered < FEW_REGISTERED * measures.frames:
         found = f"poses are found for {measures.registered} of {measures.frames} frames; the others are left out"
         yield Finding(found, CLOSER if measures.fixed else TEXTURE, prevents=False)
+    if measures.cameras == measures.fixed < ENOUGH_FIXED:
+        few = f"poses of {measures.fixed} cameras that stand still are rough"
+        yield Finding(few, f"use {ENOUGH_FIXED} cameras or more, or let one move", prevents=False)
     if measures.parallax < LITTLE_PARALLAX:
         yield Finding(f"the parallax of {measures.parallax:.1f}° is little", MOVE, prevents=False)
     if measures.reprojection_error > LARGE_ERROR:

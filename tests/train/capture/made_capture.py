@@ -47,6 +47,7 @@ def made_model(frames: FrameSet, camera_to_world: list[np.ndarray] | None = None
         method="incremental",
         others=(5, 3),
         beyond_rotation=7.5,
+        agreement=1.1,
     )
 
 

@@ -44,6 +44,7 @@ NO_SCENE = {
     "cut": ({"registered": 110, "breaks": (4.24,)}, "break off at 4.2 s"),
     "nothing but what moves": ({"registered": 20, "moving": 0.7}, "70% of the image moves"),
     "no texture": ({"registered": 0, "parallax": 0.0}, "0 of 200 frames"),
+    "wrong poses": ({"agreement": 0.29}, "29% of what frames have in common"),
     "hardly any parallax": ({"parallax": 0.4}, "0.4°"),
 }
 
@@ -58,6 +59,7 @@ def test_what_prevents_a_scene_stands_alone(changes: dict, words: str):
 
 
 IMPROVABLE = {
+    "three fixed cameras": ({"cameras": 3, "fixed": 3}, "3 cameras that stand still"),
     "few frames": ({"frames": 30, "registered": 30}, "30 frames are few"),
     "blurred": ({"blurred": 100}, "100 of 300 intervals"),
     "some without poses": ({"registered": 150}, "150 of 200"),
