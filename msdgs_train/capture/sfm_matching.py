@@ -15,6 +15,9 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 BACKGROUND_PEAK = 0.002
 """Least contrast of features of a background, a third of COLMAP's: a median of frames has little noise, and there is
 but one view of each camera."""
+MAX_FEATURES, BACKGROUND_FEATURES = 2000, 8192
+"""Of an image, and of a background; the largest ones. With 4,000, the centers of 48 frames of 1024 pixels are off by
+0.02 % of their extent instead of 0.04 % (median), in twice the time."""
 BATCH = 16
 """Images, or hundreds of pairs, between two reports of progress."""
 TOLERANCE = 1 / 700
@@ -28,8 +31,9 @@ def extract(job: PosesJob, database: Path) -> None:
     for camera in job.cameras:
         options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         reader = pycolmap.ImageReaderOptions(camera_model=CAMERA_MODEL)
+        options.sift.max_num_features = MAX_FEATURES
         if camera.frames is not None:
-            options.sift.peak_threshold = BACKGROUND_PEAK
+            options.sift.max_num_features, options.sift.peak_threshold = BACKGROUND_FEATURES, BACKGROUND_PEAK
         for names in _batches(camera.names, BATCH):
             report("features", done, total)
             mode = pycolmap.CameraMode.SINGLE
