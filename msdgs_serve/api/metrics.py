@@ -7,6 +7,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from msdgs_serve.api.work import WorkQueue
+from msdgs_serve.rasterizer.scratch import unused_bytes
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.store import SceneStore
 
@@ -81,6 +82,7 @@ class _State(Collector):
         frames.add_metric(("moving",), kept.drawn)
         frames.add_metric(("whole",), kept.whole)
         yield frames
+        yield GaugeMetricFamily("msdgs_scratch_bytes", "Memory kept for arrays of the next frames", unused_bytes())
         statuses = self._store.statuses()
         scenes = GaugeMetricFamily("msdgs_scenes", "Scenes by state", labels=("state",))
         scenes.add_metric(("known",), len(statuses))

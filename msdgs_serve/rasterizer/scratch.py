@@ -32,6 +32,11 @@ def scratch(shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
     return lent[start : start + size].view(kind).reshape(shape)
 
 
+def unused_bytes() -> int:
+    """Memory that is kept and not lent."""
+    return sum(memory.nbytes for memory in list(_unused.values()))
+
+
 def release_scratch() -> None:
     """Give unused memory back."""
     _unused.clear()
@@ -49,7 +54,7 @@ def _keep(memory: np.ndarray) -> None:
     if memory.nbytes > KEPT_BYTES:
         return
     _unused[id(memory)] = memory
-    excess = sum(kept.nbytes for kept in list(_unused.values())) - KEPT_BYTES
+    excess = unused_bytes() - KEPT_BYTES
     for key, oldest in list(_unused.items()):
         if excess > 0 and _unused.pop(key, None) is not None:
             excess -= oldest.nbytes

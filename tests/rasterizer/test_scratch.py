@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import scratch as module
-from msdgs_serve.rasterizer.scratch import release_scratch, scratch
+from msdgs_serve.rasterizer.scratch import release_scratch, scratch, unused_bytes
 
 
 @pytest.fixture(autouse=True)
@@ -48,6 +48,7 @@ def test_no_more_is_kept_than_the_limit(monkeypatch: pytest.MonkeyPatch):
     while arrays:
         del arrays[0]
     assert len(module._unused) == 2
+    assert 8_000 <= unused_bytes() <= 10_000
     assert address(scratch((4_000,), np.uint8)) == last
     assert scratch((20_000,), np.uint8).size == 20_000
     assert len(module._unused) == 2
