@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import stat
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -164,7 +165,10 @@ class DeformationSession:
     def _read(self) -> memoryview:
         try:
             with self.path.open("rb") as file:
-                contents = np.empty(os.fstat(file.fileno()).st_size, np.uint8).data
+                status = os.fstat(file.fileno())
+                if not stat.S_ISREG(status.st_mode):  # a pipe, whose size isn't known
+                    return memoryview(bytearray(file.read()))
+                contents = np.empty(status.st_size, np.uint8).data
                 return contents[: file.readinto(contents)]
         except OSError as error:
             raise SceneFileInvalid(self._file, "file", f"can't be read: {error.strerror or error}") from error

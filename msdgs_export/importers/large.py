@@ -1,4 +1,5 @@
-"""Scene files of static scenes that are too large for a message of Protobuf, which takes several times their memory."""
+"""Scene files of static scenes in float32, written from their arrays: messages of Protobuf take several times their
+memory, and have a limit."""
 
 from dataclasses import replace
 from pathlib import Path

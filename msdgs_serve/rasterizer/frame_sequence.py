@@ -6,7 +6,7 @@ from msdgs_serve.rasterizer.compositing import Still, composite
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.rasterizer.projection import project
 from msdgs_serve.rasterizer.rasterize import MAX_PAIRS, Rendering, checked_background
-from msdgs_serve.rasterizer.scratch import scratch
+from msdgs_serve.rasterizer.scratch import aligned
 from msdgs_serve.rasterizer.simd.types import NUM_LANES
 from msdgs_serve.rasterizer.splats import DEPTH, RECORD, Splats
 from msdgs_serve.rasterizer.tiles import TileLists, bin_into_tiles
@@ -53,7 +53,7 @@ class FrameSequence:
         self.touched = 0.0
         """Fraction of tiles that the last frame has drawn again."""
         first = -(-moving_count // NUM_LANES) * NUM_LANES
-        self._records = scratch((first + len(static), RECORD), static.means.dtype)
+        self._records = aligned((first + len(static), RECORD), static.means.dtype)
         self._records[first:] = splats.records
         self._depths = _depths_of(splats, lists)
         self._lists = lists._replace(splat_ids=lists.splat_ids + np.uint32(first))

@@ -22,14 +22,16 @@ _unused: dict[int, np.ndarray] = {}  # by identity, oldest first; single operati
 def scratch(shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
     """Return an array like `np.empty`, aligned to 64 bytes, whose memory is kept for others once no array refers to
     it."""
-    kind = np.dtype(dtype)
-    size = math.prod(shape) * kind.itemsize
-    memory = _taken(size + CACHE_LINE_BYTES)
+    memory = _taken(_size(shape, dtype) + CACHE_LINE_BYTES)
     # views of an array refer to it, but not to the memory below it, which has a type of its own
     lent = np.frombuffer(memory.data, np.uint8)
     weakref.finalize(lent, _keep, memory).atexit = False
-    start = -lent.ctypes.data % CACHE_LINE_BYTES
-    return lent[start : start + size].view(kind).reshape(shape)
+    return _view(lent, shape, dtype)
+
+
+def aligned(shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
+    """Return an array like `np.empty`, aligned to 64 bytes, of memory of its own: for what is kept between frames."""
+    return _view(np.empty(_size(shape, dtype) + CACHE_LINE_BYTES, np.uint8), shape, dtype)
 
 
 def unused_bytes() -> int:
@@ -40,6 +42,15 @@ def unused_bytes() -> int:
 def release_scratch() -> None:
     """Give unused memory back."""
     _unused.clear()
+
+
+def _size(shape: tuple[int, ...], dtype: npt.DTypeLike) -> int:
+    return math.prod(shape) * np.dtype(dtype).itemsize
+
+
+def _view(memory: np.ndarray, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
+    start = -memory.ctypes.data % CACHE_LINE_BYTES
+    return memory[start : start + _size(shape, dtype)].view(dtype).reshape(shape)
 
 
 def _taken(size: int) -> np.ndarray:

@@ -16,6 +16,7 @@ from msdgs_train.capture.offsets import find_offsets
 from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.recordings import WORK, claim, digest_of, held, require_disk, required_bytes
 from msdgs_train.capture.report import Report, write_report
+from msdgs_train.capture.sparse_model import FORMAT
 from msdgs_train.capture.steps import Steps, Watch
 from msdgs_train.capture.verdict import Verdict, judge, judge_frames
 
@@ -134,7 +135,7 @@ class CaptureJob:
         return note
 
     def _keep(self, name: str, run: Callable[[Path, Progress], None]) -> Path:
-        self.steps.do(name, {"seed": self.options.seed}, run)
+        self.steps.do(name, {"seed": self.options.seed, "format": FORMAT}, run)
         return self.steps.path(name)
 
     def _write_dataset(self, frames: FrameSet, found: MaskedPoses) -> None:

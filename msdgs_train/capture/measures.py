@@ -58,8 +58,9 @@ class Measures:
     """Pixels of the motion between frames of one camera that no rotation explains."""
     moving: float = 0.0
     """Mean share of a frame that moves."""
-    agreement: float = 1.0
-    """Observations of points, relative to the features that are found again in several frames; may be above 1."""
+    agreement: float = 0.0
+    """Observations of points, relative to the features that are found again in several frames; may be above 1, and
+    says nothing of cameras that all stand still."""
     breaks: tuple[float, ...] = ()
     """Seconds at which a stretch of frames with poses borders on one without, as at a cut."""
 

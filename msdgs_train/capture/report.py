@@ -86,7 +86,8 @@ def figures(measures: Measures) -> Iterator[tuple[str, str]]:
     yield "parallax, median of the frames", f"{measures.parallax:.1f}°"
     yield "baseline over depth", f"{measures.baseline:.2f}"
     yield "motion that no rotation explains", f"{measures.beyond_rotation:.1f} pixels"
-    yield "agrees with the poses, of what frames share", f"{min(measures.agreement, 1):.0%}"
+    if measures.fixed < measures.cameras:
+        yield "agrees with the poses, of what frames share", f"{min(measures.agreement, 1):.0%}"
     yield "moves, of the image", f"{measures.moving:.0%}"
     yield "intervals left out as blurred", f"{measures.blurred}"
     yield "black frames", f"{measures.black:.0%}"

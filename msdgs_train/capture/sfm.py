@@ -58,6 +58,9 @@ def find(job: PosesJob) -> None:
     elif models:
         models[0] = refined(models[0], job, database)
     largest = models[0] if models else pycolmap.Reconstruction()
+    static = workspace / STATIC
+    turned = motion_beyond_rotation(largest, job.pairs, static if static.exists() else database)
+    agreeing = agreement(largest, database)
     _color(largest, job.cameras)
     _spread_to_frames(largest, job.cameras)
     sparse = workspace / "sparse"
@@ -65,9 +68,7 @@ def find(job: PosesJob) -> None:
     sparse.mkdir()
     largest.write(sparse)
     sizes = [model.num_reg_images() for model in models]
-    static = workspace / STATIC
-    turned = motion_beyond_rotation(largest, job.pairs, static if static.exists() else database)
-    summary(largest, method, sizes[1:], turned, agreement(largest, database)).save(workspace / GEOMETRY)
+    summary(largest, method, sizes[1:], turned, agreeing).save(workspace / GEOMETRY)
     for each in workspace.glob("*.db"):
         each.unlink()
 

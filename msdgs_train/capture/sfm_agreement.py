@@ -20,22 +20,27 @@ def motion_beyond_rotation(model: pycolmap.Reconstruction, names: Sequence[tuple
     It is that of the model's points, in pairs of images of these names, or without those, of the matches of a database.
     """
     pairs = [*_pairs_of_model(model, names)] or [*_pairs_of_matches(database)]
-    sizes = [max(camera.width, camera.height) for camera in model.cameras.values()]
-    return max(sizes, default=1) * beyond_rotation(pairs)
+    with pycolmap.Database.open(database) as opened:
+        sizes = [max(camera.width, camera.height) for camera in opened.read_all_cameras()]
+    return max(sizes) * beyond_rotation(pairs)
 
 
 def agreement(model: pycolmap.Reconstruction, database: Path) -> float:
-    """Observations of the model's points, relative to the features that are found again in several images.
+    """Observations of the model's points, relative to the features of its images that are found again in several ones.
 
-    It may be above 1, as points are completed by features that were found again less often.
+    It may be above 1, as points are completed by features that were found again less often. It says nothing of fixed
+    cameras, with one view each.
     """
+    names = {model.image(image_id).name for image_id in model.reg_image_ids()}
     with pycolmap.Database.open(database) as opened:
-        counts = {image.image_id: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
-        found = {image_id: np.zeros(count, int) for image_id, count in counts.items()}
+        ids = [image.image_id for image in opened.read_all_images() if image.name in names]
+        found = {image_id: np.zeros(opened.num_keypoints_for_image(image_id), int) for image_id in ids}
         for key, geometry in zip(*opened.read_two_view_geometries(), strict=True):
             matches = np.asarray(geometry.inlier_matches, np.int64).reshape(-1, 2)
-            for image_id, features in zip(pycolmap.pair_id_to_image_pair(key), matches.T, strict=True):
-                found[image_id][features] += 1
+            pair = pycolmap.pair_id_to_image_pair(key)
+            if found.keys() >= set(pair):
+                for image_id, features in zip(pair, matches.T, strict=True):
+                    found[image_id][features] += 1
     again = sum(int((each >= FOUND_AGAIN).sum()) for each in found.values())
     return model.compute_num_observations() / max(again, 1)
 

@@ -66,9 +66,9 @@ def _with_lenses(shared: pycolmap.Reconstruction, database: Path) -> pycolmap.Re
 
 def _suffices(shared: pycolmap.Reconstruction, own: pycolmap.Reconstruction) -> bool:
     errors = [model.compute_mean_reprojection_error() for model in (shared, own)]
-    return shared.num_reg_images() >= own.num_reg_images() and errors[0] <= ONE_LENS * errors[1]
+    return _quality(shared)[:2] >= _quality(own)[:2] and errors[0] <= ONE_LENS * errors[1]
 
 
-def _quality(model: pycolmap.Reconstruction) -> tuple[int, float]:
-    """Images, and the smallness of the error."""
-    return model.num_reg_images(), -model.compute_mean_reprojection_error()
+def _quality(model: pycolmap.Reconstruction) -> tuple[int, bool, float]:
+    """Images, whether they see points, which a refinement may remove, and the smallness of the error."""
+    return model.num_reg_images(), model.num_points3D() > 0, -model.compute_mean_reprojection_error()

@@ -8,6 +8,8 @@ import numpy as np
 from msdgs_serve.writing import replacing
 
 GEOMETRY = "geometry.npz"
+FORMAT = 2
+"""Of that file; a step that made another one runs again."""
 BUNDLE = 8
 """Observing cameras of a point among which its largest parallax is searched."""
 

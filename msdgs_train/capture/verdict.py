@@ -1,6 +1,6 @@
 """What a capture is worth, in words: good, or what to record differently.
 
-The limits of rotation and parallax are where scenes of known truth stop being found, or found well:
+The limits of rotation, agreement and parallax are where scenes of known truth stop being found, or found well:
 `python -m benchmarks.capture.verdicts`, docs/your_scene.md. The others are chosen.
 """
 
@@ -21,8 +21,8 @@ MIN_WHOLE = 0.75
 MIN_BEYOND_ROTATION, LEAST_PIXELS = 1 / 1000, 0.65
 """In longer sides of the frames, and in pixels at least, as matches are no better."""
 MIN_AGREEMENT = 0.4
-"""Of the features that are found again, as observations of points: 1.0 and more with right poses, and 0.3 at most with
-wrong ones."""
+"""Of the features of moving cameras that are found again, as observations of points: 0.9 and more with right poses, and
+0.3 at most with wrong ones."""
 MIN_SEEN = 15
 """Points that a frame sees, for poses that are more than guesses."""
 MIN_PARALLAX, LITTLE_PARALLAX = 1.0, 4.0
@@ -135,7 +135,7 @@ def _without_poses(measures: Measures) -> Iterator[Finding]:
         yield Finding(found, CLOSER if measures.fixed else TEXTURE, prevents=True)
     elif measures.seen < MIN_SEEN:
         yield Finding(f"a frame sees {measures.seen:.0f} points that poses agree on, which is too few", TEXTURE, True)
-    elif measures.agreement < MIN_AGREEMENT:
+    elif measures.fixed < measures.cameras and measures.agreement < MIN_AGREEMENT:
         few = f"poses agree with {measures.agreement:.0%} of what frames have in common, so that they are wrong"
         yield Finding(few, "keep more of what stands still in view, and move slower", prevents=True)
     elif measures.parallax < MIN_PARALLAX:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from msdgs_serve.rasterizer import scratch as module
-from msdgs_serve.rasterizer.scratch import release_scratch, scratch, unused_bytes
+from msdgs_serve.rasterizer.scratch import aligned, release_scratch, scratch, unused_bytes
 
 
 @pytest.fixture(autouse=True)
@@ -67,3 +67,12 @@ def test_threads_never_share_memory():
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(work, range(1, 9)))
+
+
+def test_what_is_kept_between_frames_has_memory_of_its_own():
+    lent = scratch((4_000,), np.uint8)
+    del lent
+    kept = aligned((10, 16), np.float32)
+    assert address(kept) % 64 == 0
+    assert kept.nbytes == 640
+    assert unused_bytes() >= 4_000

@@ -1,6 +1,7 @@
 """The reader of scene files: times, ids, threads and memory."""
 
 import hashlib
+import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -51,6 +52,16 @@ def test_all_moving_gaussians_by_default(session: DeformationSession):
     gaussians = session.gaussians(0.5).validate()
     assert (len(gaussians), gaussians.sh_degree) == (1000, 3)
     assert np.array_equal(gaussians.means, means)
+
+
+def test_a_scene_file_may_come_from_a_pipe(path: Path, tmp_path: Path):
+    pipe = tmp_path / "scene.onnx"
+    os.mkfifo(pipe)
+    with ThreadPoolExecutor(1) as pool:
+        written = pool.submit(pipe.write_bytes, path.read_bytes())
+        session = DeformationSession(pipe)
+        assert written.result() == path.stat().st_size
+    assert session.scene.moving_count == 1000
 
 
 def test_moving_gaussians_come_first_then_static_ones(tmp_path: Path):

@@ -49,7 +49,7 @@ class Tensor:
     data: memoryview
 
     def array(self) -> np.ndarray:
-        """Return a view of the values, read-only and unaligned."""
+        """Return a view of the values, which may be unaligned; nobody writes to it."""
         return np.frombuffer(self.data, DTYPES[self.element]).reshape(self.shape)
 
 

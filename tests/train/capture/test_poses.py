@@ -19,6 +19,7 @@ from msdgs_train.capture.frames import extract_frames
 from msdgs_train.capture.image_files import read_color, read_gray, write_image
 from msdgs_train.capture.moving import find_moving
 from msdgs_train.capture.poses import Poses, find_poses
+from msdgs_train.capture.verdict import MIN_AGREEMENT
 from msdgs_train.datasets import SceneData, load_scene
 from tests.support.clips import Clip, fixed_camera_clips
 from tests.support.tolerances import tolerance
@@ -135,6 +136,10 @@ def test_frames_of_a_fixed_camera_share_its_pose(rig: tuple[list[Clip], Path, Fr
         own = poses.summary.camera_to_world[[name in names for name in poses.registered]]
         assert len(own) == len(names) > 1
         assert (own == own[0]).all()
+
+
+def test_right_poses_agree_with_what_frames_have_in_common(captured: Captured):
+    assert 1.5 * MIN_AGREEMENT < captured.found.poses.summary.agreement < 2
 
 
 def test_fixed_cameras_of_one_lens_share_its_intrinsics(rig: tuple[list[Clip], Path, FrameSet, Poses]):

@@ -23,6 +23,7 @@ GOOD = Measures(
     parallax_of_frames=(25.0,) * 200,
     baseline=0.6,
     beyond_rotation=20.0,
+    agreement=1.1,
     seen=300.0,
     size=1024,
     moving=0.15,
@@ -83,7 +84,7 @@ def test_all_that_could_be_better_is_said():
     assert len(verdict.text.splitlines()) == 3
 
 
-@pytest.mark.parametrize("changes", [{"cameras": 6, "fixed": 6, "beyond_rotation": 0.0},
+@pytest.mark.parametrize("changes", [{"cameras": 6, "fixed": 6, "beyond_rotation": 0.0, "agreement": 0.2},
                                      {"cameras": 3, "fixed": 2, "beyond_rotation": 0.0}])  # fmt: skip
 def test_several_fixed_cameras_need_no_motion(changes: dict):
     assert judge(replace(GOOD, **changes)).level == "good"
