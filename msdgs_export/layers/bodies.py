@@ -5,18 +5,14 @@ from typing import cast
 import numpy as np
 
 from msdgs_export.layers.base import HEADS, LayerInputs
-from msdgs_export.layers.curves import curves_at
+from msdgs_export.layers.curves import CurveLayerExport, curves_at
 from msdgs_export.layers.graph import GraphBuilder, to_numpy
 from msdgs_export.layers.rotations import IDENTITY, turn_columns, turned, unit_rows
-from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.bodies import BodiesLayer
 
 
-class BodiesExport:
+class BodiesExport(CurveLayerExport):
     """Exports `BodiesLayer`."""
-
-    removable_heads: frozenset[str] = frozenset()
-    scale_columns = 6
 
     def deltas(self, graph: GraphBuilder, inputs: LayerInputs, used: list[str]) -> str:
         """[nodes, 13] translations, stretches of 0, and quaternions minus the identity."""
@@ -32,18 +28,6 @@ class BodiesExport:
         zeros = graph.constant(f"{name}.stretches", np.zeros((len(weights), 6), np.float32))
         columns = graph.node("Concat", [shifts, zeros, quats], f"{name}.raw", axis=1)
         return graph.node("Mul", [columns, inputs.gate], f"{name}.gated")
-
-    def point_constants(self, layer: DeformationLayer, points: np.ndarray) -> dict[str, np.ndarray]:
-        """None: weights belong to nodes, wherever they are."""
-        return {}
-
-    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
-        """No heads, since a body translates and rotates."""
-        return frozenset()
-
-    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
-        """The layer as it is: it has no heads to remove."""
-        return layer
 
 
 def _motions(graph: GraphBuilder, name: str, layer: BodiesLayer, time: str) -> str:

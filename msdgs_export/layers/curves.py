@@ -6,10 +6,30 @@ import numpy as np
 from onnx import TensorProto
 
 from msdgs_export.layers.graph import GraphBuilder, to_numpy
+from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.curves import CurveLayer
 
 KNOTS = 4
 """Number of knots that determine the value at a time."""
+
+
+class CurveLayerExport:
+    """Base of kinds that move control nodes along curves: all heads change together."""
+
+    removable_heads: frozenset[str] = frozenset()
+    scale_columns = 6
+
+    def point_constants(self, layer: DeformationLayer, points: np.ndarray) -> dict[str, np.ndarray]:
+        """None: curves and weights belong to nodes, wherever they are."""
+        return {}
+
+    def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
+        """No heads, since curves translate and rotate."""
+        return frozenset()
+
+    def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
+        """The layer as it is: it has no heads to remove."""
+        return layer
 
 
 def curves_at(graph: GraphBuilder, name: str, layer: CurveLayer, curves: Sequence[np.ndarray], time: str) -> str:
