@@ -3,7 +3,8 @@
 A moving camera has a view for each of its frames. The frames of a camera that stands still share one pose: its view is
 the background, the median of its frames, which is free of what moves. Views of one camera share its intrinsics.
 
-A model is made of matches on what stands still (`static_tracks`), and then refined with all that agree with its poses.
+A model of keyframes is made of matches on what stands still (`static_tracks`), and then refined with all that agree
+with its poses. The other frames are registered to it.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from msdgs_train.capture.image_files import write_image
 from msdgs_train.capture.progress import Progress
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, run_sfm
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
-from msdgs_train.capture.views import View, matched_pairs
+from msdgs_train.capture.views import View, keyframes, matched_pairs, pairs_with_keyframes
 
 SPARSE = "sparse"
 BACKGROUNDS = "backgrounds"
@@ -68,15 +69,21 @@ def find_poses(
     views = [View(frame.name, frame.camera, frame.time) for frame in frames.frames if not fixed[frame.camera]] + [
         View(f"{camera}.png", camera, 0.0, True) for camera, stands in enumerate(fixed) if stands
     ]
+    keys = keyframes(views)
+    chosen = {view.name for view in keys}
     cameras = tuple(
         CameraViews(str(workspace / BACKGROUNDS), (f"{camera}.png",), own)
         if fixed[camera]
-        else CameraViews(str(images.absolute()), own)
+        else CameraViews(
+            str(images.absolute()),
+            tuple(name for name in own if name in chosen),
+            others=tuple(name for name in own if name not in chosen),
+        )
         for camera, own in enumerate(names)
         if own
     )
-    pairs = tuple(matched_pairs(views))
-    job = PosesJob(str(workspace), cameras, pairs, seed, threads or ALL_PROCESSORS, all_matches)
+    pairs, other_pairs = tuple(matched_pairs(keys)), tuple(pairs_with_keyframes(views))
+    job = PosesJob(str(workspace), cameras, pairs, other_pairs, seed, threads or ALL_PROCESSORS, all_matches)
     run_sfm(job, images, progress)
     return Poses.load(workspace, frames)
 

@@ -22,6 +22,7 @@ from msdgs_train.capture.sfm_fixed import of_fixed_cameras
 from msdgs_train.capture.sfm_mapping import STATIC, mapped, refined
 from msdgs_train.capture.sfm_matching import extract, match, only_fixed
 from msdgs_train.capture.sfm_process import CameraViews, PosesJob, UndistortedJob
+from msdgs_train.capture.sfm_registration import register_others
 from msdgs_train.capture.sfm_report import start_reports
 from msdgs_train.capture.sparse_model import GEOMETRY, Summary
 
@@ -35,7 +36,7 @@ def main() -> None:
     job: dict[str, Any] = json.loads(sys.stdin.readline())
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     if job["kind"] == "poses":
-        cameras = tuple(CameraViews(**{**camera, "names": tuple(camera["names"])}) for camera in job["cameras"])
+        cameras = tuple(CameraViews(**camera) for camera in job["cameras"])
         find(PosesJob(**{**job, "cameras": cameras}))
     else:
         write_undistorted(UndistortedJob(**job))
@@ -51,7 +52,7 @@ def find(job: PosesJob) -> None:
     database.unlink(missing_ok=True)
     pycolmap.set_random_seed(job.seed)
     extract(job, database)
-    match(job, database)
+    match(job, database, job.pairs)
     models, method = mapped(job, database)
     if only_fixed(job):
         models, method = of_fixed_cameras(job, database, (models, method))
@@ -62,6 +63,7 @@ def find(job: PosesJob) -> None:
     turned = motion_beyond_rotation(largest, job.pairs, static if static.exists() else database)
     agreeing = agreement(largest, database)
     _color(largest, job.cameras)
+    register_others(largest, job, database)
     _spread_to_frames(largest, job.cameras)
     sparse = workspace / "sparse"
     shutil.rmtree(sparse, ignore_errors=True)

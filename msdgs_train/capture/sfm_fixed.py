@@ -26,7 +26,7 @@ def of_fixed_cameras(job: PosesJob, database: Path, found: Models) -> Models:
         scratch = database.with_name("one_lens.db")
         scratch.unlink(missing_ok=True)
         extract(shared_job, scratch)
-        match(shared_job, scratch)
+        match(shared_job, scratch, shared_job.pairs)
         others, by = mapped(shared_job, scratch)
         if others:
             others[0] = refined(others[0], shared_job, scratch)

@@ -26,33 +26,43 @@ pixels, which in a small image is the motion of an object between two frames."""
 
 
 def extract(job: PosesJob, database: Path) -> None:
-    """Write the cameras and SIFT features of all views."""
-    total, done = sum(len(camera.names) for camera in job.cameras), 0
-    for camera in job.cameras:
+    """Write the cameras and SIFT features of the images that the model is made of."""
+    _extract(job, database, [camera.names for camera in job.cameras])
+
+
+def extract_others(job: PosesJob, database: Path) -> None:
+    """Write the features of the other images."""
+    _extract(job, database, [camera.others for camera in job.cameras])
+
+
+def _extract(job: PosesJob, database: Path, names_of_cameras: Sequence[Sequence[str]]) -> None:
+    total, done = sum(map(len, names_of_cameras)), 0
+    for camera, all_names in zip(job.cameras, names_of_cameras, strict=True):
         options = pycolmap.FeatureExtractionOptions(num_threads=job.threads, use_gpu=False)
         reader = pycolmap.ImageReaderOptions(camera_model=CAMERA_MODEL)
         options.sift.max_num_features = MAX_FEATURES
         if camera.frames is not None:
             options.sift.max_num_features, options.sift.peak_threshold = BACKGROUND_FEATURES, BACKGROUND_PEAK
-        for names in _batches(camera.names, BATCH):
+        reader.existing_camera_id = _camera_of(database, camera.names[0])
+        for names in _batches(all_names, BATCH):
             report("features", done, total)
             mode = pycolmap.CameraMode.SINGLE
             pycolmap.extract_features(database, Path(camera.folder), list(names), mode, reader, options)
             if reader.existing_camera_id < 0:
-                reader.existing_camera_id = _camera_of(database, names[0])
+                reader.existing_camera_id = _camera_of(database, camera.names[0])
             done += len(names)
     report("features", total, total)
 
 
-def match(job: PosesJob, database: Path) -> None:
-    """Match the pairs and write their two-view geometries."""
+def match(job: PosesJob, database: Path, all_pairs: Sequence[tuple[str, str]]) -> None:
+    """Match pairs of images and write their two-view geometries."""
     options = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     options.guided_matching = only_fixed(job)
     geometry = geometry_options(job, database)
     chosen = Path(job.workspace) / "pairs.txt"
     done = 0
-    for pairs in _batches(job.pairs, 100):
-        report("matching", done, len(job.pairs))
+    for pairs in _batches(all_pairs, 100):
+        report("matching", done, len(all_pairs))
         chosen.write_text("".join(f"{first} {second}\n" for first, second in pairs), encoding="utf-8")
         pairing = pycolmap.ImportedPairingOptions(match_list_path=chosen)
         pycolmap.match_image_pairs(database, options, pairing, geometry)

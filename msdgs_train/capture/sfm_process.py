@@ -29,6 +29,8 @@ class CameraViews:
     names: tuple[str, ...]
     frames: tuple[str, ...] | None = None
     """Names of all frames of a fixed camera, which get the pose of its only view."""
+    others: tuple[str, ...] = ()
+    """Images that are registered to the finished model of the named ones."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,9 @@ class PosesJob:
     workspace: str
     cameras: tuple[CameraViews, ...]
     pairs: tuple[tuple[str, str], ...]
+    """Images of the model to match."""
+    other_pairs: tuple[tuple[str, str], ...]
+    """Images that are registered to it, and those of it to match them with."""
     seed: int
     threads: int
     """-1: all processors."""

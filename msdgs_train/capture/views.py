@@ -1,5 +1,6 @@
 """The images that poses are found of, and the pairs of them that are matched."""
 
+from bisect import bisect
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -9,10 +10,15 @@ T = TypeVar("T")
 
 OVERLAP = 10
 """Following frames that a frame is matched with; beyond them those at distances of powers of two."""
-KEYFRAMES = 24
+REVISITS = 24
 """Frames of a moving camera, at even distances, that are all matched with each other: the camera may come back."""
 LINKS = 40
 """Frames of a moving camera that are matched with those of another camera."""
+KEYFRAMES = 100
+"""Frames of a moving camera that a model is made of. In a model of all 300 frames of an arc of 60°, what moves little
+between neighbors passes for what stands still: the largest error of centers is 12 % of their extent, not 0.07 %."""
+NEAREST = 2
+"""Keyframes before and after another frame that it is matched with."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +35,33 @@ class View:
 
 def matched_pairs(views: Sequence[View]) -> list[tuple[str, str]]:
     """Names of the views to match: neighbors, keyframes, and views of one time across cameras."""
-    cameras = [[view for view in views if view.camera == camera] for camera in sorted({view.camera for view in views})]
+    cameras = _by_camera(views)
     pairs = [pair for own in cameras for pair in _own_pairs(own)]
     pairs += [pair for one, other in combinations(cameras, 2) for pair in _cross_pairs(one, other)]
     return list(dict.fromkeys((first.name, second.name) for first, second in pairs))
+
+
+def keyframes(views: Sequence[View]) -> list[View]:
+    """The views that a model is made of, in their order."""
+    chosen = {view for own in _by_camera(views) for view in spread(own, KEYFRAMES)}
+    return [view for view in views if view in chosen]
+
+
+def pairs_with_keyframes(views: Sequence[View]) -> list[tuple[str, str]]:
+    """Names of each view that is no keyframe, and of the keyframes of its camera around it."""
+    chosen, pairs = set(keyframes(views)), []
+    for own in _by_camera(views):
+        keys = [index for index, view in enumerate(own) if view in chosen]
+        for index, view in enumerate(own):
+            if view not in chosen:
+                after = bisect(keys, index)
+                around = keys[max(after - NEAREST, 0) : after + NEAREST]
+                pairs += [(view.name, own[key].name) for key in around]
+    return pairs
+
+
+def _by_camera(views: Sequence[View]) -> list[list[View]]:
+    return [[view for view in views if view.camera == camera] for camera in sorted({view.camera for view in views})]
 
 
 def _own_pairs(views: Sequence[View]) -> Iterator[tuple[View, View]]:
@@ -41,7 +70,7 @@ def _own_pairs(views: Sequence[View]) -> Iterator[tuple[View, View]]:
         distances.append(1 << distances[-1].bit_length())
     for first, view in enumerate(views):
         yield from ((view, views[first + distance]) for distance in distances if first + distance < len(views))
-    yield from combinations(spread(views, KEYFRAMES), 2)
+    yield from combinations(spread(views, REVISITS), 2)
 
 
 def _cross_pairs(one: Sequence[View], other: Sequence[View]) -> Iterator[tuple[View, View]]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from msdgs_train.capture import sfm_process
+from msdgs_train.capture import sfm_process, views
 from msdgs_train.capture.dataset import MOTION_MASKS, write_dataset
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.fixed_cameras import is_fixed
@@ -21,20 +21,20 @@ from msdgs_train.capture.moving import find_moving
 from msdgs_train.capture.poses import Poses, find_poses
 from msdgs_train.capture.verdict import MIN_AGREEMENT
 from msdgs_train.datasets import SceneData, load_scene
-from tests.support.clips import Clip, fixed_camera_clips
+from tests.support.clips import Clip, fixed_camera_clips, moving_camera_clip
 from tests.support.tolerances import tolerance
 from tests.support.training_scene import small_config, splatting, trained
-from tests.train.capture.conftest import COUNT, Captured
+from tests.train.capture.conftest import ARC, COUNT, Captured
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("captured")]
 STEPS = 2
 
 
-def worst_turn(captured: Captured, poses: Poses) -> float:
+def worst_turn(clip: Clip, frames: FrameSet, poses: Poses) -> float:
     """The largest error in degrees of the rotation between two neighbours; no alignment has a part in it."""
-    times = {frame.name: frame.time for frame in captured.frames.frames}
-    order = [int(np.abs(captured.clip.times - times[name]).argmin()) for name in poses.registered]
-    found, true = poses.summary.camera_to_world[:, :3, :3], captured.clip.camera_to_world[order][:, :3, :3]
+    times = {frame.name: frame.time for frame in frames.frames}
+    order = [int(np.abs(clip.times - times[name]).argmin()) for name in poses.registered]
+    found, true = poses.summary.camera_to_world[:, :3, :3], clip.camera_to_world[order][:, :3, :3]
     steps = [turns[:-1].transpose(0, 2, 1) @ turns[1:] for turns in (found, true)]
     traces = np.einsum("nij,nij->n", *steps)
     return float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1))).max())
@@ -43,7 +43,22 @@ def worst_turn(captured: Captured, poses: Poses) -> float:
 def test_all_frames_have_poses_near_the_true_ones(captured: Captured):
     poses = Poses.load(captured.step("poses"), captured.frames)
     assert len(poses.registered) == len(captured.frames.frames) == COUNT
-    assert worst_turn(captured, poses) < tolerance("capture.turn")
+    assert worst_turn(captured.clip, captured.frames, poses) < tolerance("capture.turn")
+
+
+def test_frames_that_are_not_in_the_model_are_registered_to_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(views, "KEYFRAMES", COUNT // 2)
+    clip = moving_camera_clip(tmp_path / "clip.mp4", width=224, frames=COUNT, arc=ARC, poster=False)
+    images, stages = tmp_path / "images", {}
+    frames = extract_frames([clip.file], images)
+    poses = find_poses(
+        images, frames, tmp_path, threads=1, progress=lambda stage, _, total: stages.update({stage: total})
+    )
+    assert stages["mapping"] == stages["other frames"] == COUNT // 2
+    assert len(poses.registered) == COUNT
+    assert worst_turn(clip, frames, poses) < tolerance("capture.turn")
+    observing = np.bincount(poses.summary.observations[:, 0], minlength=COUNT)
+    assert observing.min() >= 30
 
 
 def test_most_of_what_is_masked_moves_and_most_of_what_moves_is_masked(captured: Captured):
