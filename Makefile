@@ -15,9 +15,9 @@ FULL := .venv
 CLUSTER := .venv-cluster
 VIEWER := .venv-viewer
 HTTP_TESTS := tests/service tests/frames/test_video.py --ignore-glob='*/test_viewer*'
-FUZZERS := tests/service/test_openapi.py tests/service/test_hostile_uploads.py tests/scene/test_structured_fuzz.py \
-	tests/export/test_importers_damaged.py tests/export/test_work_precision.py tests/frames/test_blocks.py \
-	tests/rasterizer/test_rasterizer_stress.py
+FUZZERS := tests/service/test_openapi.py tests/service/test_hostile_uploads.py tests/service/test_sequences.py \
+	tests/scene/test_structured_fuzz.py tests/export/test_importers_damaged.py tests/export/test_work_precision.py \
+	tests/frames/test_blocks.py tests/rasterizer/test_rasterizer_stress.py
 BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.parts rasterizer.still_camera \
 	rasterizer.avx512 service.scaling training.training_step training.gpu_step training.known_motion \
 	training.k_steps training.realistic paper export.imported_formats export.paper_sized \

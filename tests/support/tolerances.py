@@ -115,6 +115,11 @@ TABLE = (
     Row("served_frame", 1e-3, "of a float pixel; onnxruntime's exponentials and products are not torch's to the bit"),
     Row("drawn_here_db", 40.0, "WebGL2 blends splat after splat in 10 bits, of twice the range, against float32"),
     Row("served_frame.8bit", 0.756, "of 255; as served_frame, and half a step of 8 bits"),
+    Row(
+        "frames.other_processor",
+        60.0,
+        "dB, at least; splats at a threshold of alpha are drawn on one kind of processor only",
+    ),
     Row("read_pose", 1e-6, "of values of size 1: the same graph in float32, by two builds of onnxruntime"),
     # stability: made cases, docs/stability.md
     Row("stability.accepted_db", 50.0, "the export's default bound, which accepted models must keep"),
