@@ -4,8 +4,10 @@ import logging
 import threading
 import time
 from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from enum import Enum
+from functools import cache
 from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated
@@ -22,6 +24,7 @@ from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.uploads import Uploads
 from msdgs_serve.api.work import WorkQueue
 from msdgs_serve.imaging import encode
+from msdgs_serve.rasterizer.precompile import draw_tiny_frames
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.store import SceneStore, ServedScene
@@ -136,10 +139,13 @@ class Service:
             self._refresh()
 
     def _warm_up(self) -> None:
-        """Load the scenes given as files, and render a small frame of any scene to compile the kernels."""
+        """Load the scenes given as files and meanwhile the kernels, and render a small frame of any scene."""
         files = [path.stem for path in self.settings.scenes if path.is_file()]
-        for name in files:
-            self.store.get(name)
+        with ThreadPoolExecutor(1) as beside:  # a second of the five until a scene of 1 GB is ready
+            kernels = beside.submit(_load_kernels)
+            for name in files:
+                self.store.get(name)
+            kernels.result()
         for name in files or self.store.names():
             try:
                 self._render_small(self.store.get(name))
@@ -166,6 +172,12 @@ class Service:
                 self.store.clear_incoming()
         except Exception:
             logger.exception("refreshing the scenes failed")
+
+
+@cache
+def _load_kernels() -> None:
+    """Load the kernels, or compile them, once for all services of the process."""
+    draw_tiny_frames()
 
 
 async def _service(request: Request) -> Service:
