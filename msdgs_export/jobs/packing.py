@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import onnx
+from onnx import numpy_helper
 
 from msdgs_export.jobs.candidate import UNUSABLE, Candidate, Measured
 from msdgs_export.jobs.ruler import CAMERAS_PER_TIME, ESTIMATE_STRIDE, EVALUATION_TIMES, Ruler
@@ -22,6 +23,9 @@ from msdgs_serve.rasterizer import as_trained
 METADATA_BYTES = 3000
 """Bytes that are kept free for what is measured last and added to the metadata of the written file."""
 
+SAMPLE = 250_000
+"""Gaussians of a static scene, at most, by which kinds of storage are chosen; the result is measured with all."""
+
 Measure = Callable[[onnx.ModelProto, int], RenderedError]
 """The error of a scene file's frames: of all, or of every n-th."""
 
@@ -30,7 +34,7 @@ def stored(chosen: Measured, ruler: Ruler, min_psnr: float) -> Measured:
     """The candidate with packed arrays, whose worst frame has at least `min_psnr` dB as the given one has; or the given
     one if nothing can be packed."""
     trial = _Trial(chosen.candidate, ruler)
-    found = _in_fewer_bits(trial.contents, trial.error, min_psnr)
+    found = _in_fewer_bits(trial.contents, trial.error, min_psnr, trial.contents, trial.error)
     return chosen if found is None else trial.kept(*found)
 
 
@@ -41,11 +45,23 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
     Raises `InvalidInput` for a `min_psnr` that can't be reached or is too low, and `SceneFileInvalid`.
     """
     check_min_psnr(min_psnr)
+    exact = _session(contents)
+    every = 1 if exact.scene.moving_count else math.ceil(len(exact.scene) / SAMPLE)
+    measured = _against(exact)
+    if every > 1:
+        sample = _thinned(contents, len(exact.scene), every)
+        found = _in_fewer_bits(contents, measured, min_psnr, sample, _against(_session(sample)))
+    else:
+        found = _in_fewer_bits(contents, measured, min_psnr, contents, measured)
+    return None if found is None else (_with_entry(contents, *found), found[1])
 
-    def session(model: onnx.ModelProto) -> DeformationSession:
-        return DeformationSession("scene.onnx", contents=model.SerializeToString())
 
-    exact = session(contents)
+def _session(model: onnx.ModelProto) -> DeformationSession:
+    return DeformationSession("scene.onnx", contents=model.SerializeToString())
+
+
+def _against(exact: DeformationSession) -> Measure:
+    """The error of files with the same Gaussians."""
     metadata = exact.scene.metadata
     views = evaluation_views(cameras_of_file(metadata), metadata.time_range, EVALUATION_TIMES, CAMERAS_PER_TIME)
     if not exact.scene.moving_count:
@@ -54,18 +70,27 @@ def stored_anew(contents: onnx.ModelProto, min_psnr: float) -> tuple[onnx.ModelP
     views = within_memory(views, len(ids))
     place = metadata.scene_to_world
     frames = ExactFrames(exact.gaussians, views, metadata.background, as_trained(metadata), unit=place.scale)
+    return lambda model, every: frames.measure(_session(model).gaussians, ids, every=every)
 
-    def measured(model: onnx.ModelProto, every: int) -> RenderedError:
-        return frames.measure(session(model).gaussians, ids, every=every)
 
-    found = _in_fewer_bits(contents, measured, min_psnr)
-    return None if found is None else (_with_entry(contents, *found), found[1])
+def _thinned(contents: onnx.ModelProto, count: int, every: int) -> onnx.ModelProto:
+    """A static scene file with every n-th of its `count` Gaussians."""
+    model = onnx.ModelProto()
+    model.CopyFrom(contents)
+    for tensor in model.graph.initializer:
+        if tensor.dims and tensor.dims[0] == count:
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor)[::every], tensor.name))
+    for output in model.graph.output:
+        rows = output.type.tensor_type.shape.dim[0]
+        rows.dim_value = math.ceil(count / every) if rows.dim_value == count else rows.dim_value
+    return model
 
 
 def _in_fewer_bits(
-    contents: onnx.ModelProto, measured: Measure, min_psnr: float
+    contents: onnx.ModelProto, measured: Measure, min_psnr: float, sample: onnx.ModelProto, of_sample: Measure
 ) -> tuple[Stored, RenderedError] | None:
-    """The smallest file whose worst frame has `min_psnr`, and its error."""
+    """The smallest file whose worst frame has `min_psnr`, and its error; `sample` and its errors tell which arrays can
+    be coarse."""
     allowed = list[RenderedError]()
 
     def is_allowed(model: onnx.ModelProto) -> bool:
@@ -75,7 +100,7 @@ def _in_fewer_bits(
             return error.psnr_worst >= min_psnr
         return False
 
-    found = fewest_bytes(contents, _estimate(measured), is_allowed)
+    found = fewest_bytes(contents, _estimate(of_sample), is_allowed, sample)
     return None if found is None else (found, allowed[-1])
 
 

@@ -76,13 +76,15 @@ def fewest_bytes(
     contents: onnx.ModelProto,
     estimate: Callable[[onnx.ModelProto], float],
     is_allowed: Callable[[onnx.ModelProto], bool],
+    sample: onnx.ModelProto | None = None,
 ) -> Stored | None:
     """The smallest scene file that `is_allowed`, or None if only the given one is.
 
     All groups start with their coarsest kind, and the one with the largest squared error per byte, estimated with that
-    group alone packed, becomes finer until the file is allowed: found by bisection.
+    group alone packed, becomes finer until the file is allowed: found by bisection. The estimates are of `sample`, the
+    same file with fewer Gaussians, if it is given.
     """
-    steps = [kinds for kinds in _Choice(contents, estimate).steps() if kinds]
+    steps = [kinds for kinds in _Choice(contents if sample is None else sample, estimate).steps() if kinds]
     found, first, last = None, 0, len(steps)
     while first < last:
         middle = (first + last) // 2
