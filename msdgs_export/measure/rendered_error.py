@@ -18,7 +18,7 @@ MEMORY = 768e6
 """Largest size in bytes of exact frames and poses; with larger images there are fewer views."""
 
 BLOCK = 1 << 15
-"""Points that are projected at once: of millions, all at once take three times as long."""
+"""Points projected at a time: projecting millions at once takes three times as long."""
 
 POSE_BYTES = 52
 """Bytes per Gaussian and time: its mean in float64, the rest in float32."""

@@ -84,6 +84,8 @@ def fewest_bytes(
     group alone packed, becomes finer until the file is allowed: found by bisection. The estimates are of `sample`, the
     same file with fewer Gaussians, if it is given.
     """
+    if not _members(contents):
+        return None
     steps = [kinds for kinds in _Choice(contents if sample is None else sample, estimate).steps() if kinds]
     found, first, last = None, 0, len(steps)
     while first < last:

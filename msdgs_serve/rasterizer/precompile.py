@@ -44,7 +44,10 @@ def compile_kernels() -> Path:
 
 
 def draw_tiny_frames() -> None:
-    """Draw float32 frames that need all kernels: they are loaded, or compiled and stored."""
+    """Draw float32 frames that need all kernels: they are loaded, or compiled and stored. Without the compiler there
+    are none, and frames would take minutes."""
+    if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
+        return
     pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
     for count in COUNTS:
         camera = Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose)

@@ -38,7 +38,7 @@ class Measures:
     """Cameras that stand still."""
     points: int = 0
     other_models: tuple[int, ...] = ()
-    """Frames of models that are not used."""
+    """Keyframes of models that are not used."""
     method: str = ""
     """The mapper whose model is used: incremental or global."""
     reprojection_error: float = 0.0

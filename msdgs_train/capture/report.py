@@ -94,7 +94,7 @@ def figures(measures: Measures) -> Iterator[tuple[str, str]]:
     yield "cuts", ", ".join(f"{cut:.1f} s" for cut in measures.cuts) or "none"
     yield "points", f"{measures.points:,}; {measures.seen:.0f} in a frame"
     yield "mapper", measures.method or "none"
-    yield "frames of other models", ", ".join(map(str, measures.other_models)) or "none"
+    yield "keyframes of other models", ", ".join(map(str, measures.other_models)) or "none"
 
 
 def _parallax(report: Report) -> dict[str, float]:

@@ -64,6 +64,7 @@ def find(job: PosesJob) -> None:
     agreeing = agreement(largest, database)
     _color(largest, job.cameras)
     register_others(largest, job, database)
+    largest.update_point_3d_errors()
     _spread_to_frames(largest, job.cameras)
     sparse = workspace / "sparse"
     shutil.rmtree(sparse, ignore_errors=True)

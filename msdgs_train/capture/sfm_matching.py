@@ -43,13 +43,13 @@ def _extract(job: PosesJob, database: Path, names_of_cameras: Sequence[Sequence[
         options.sift.max_num_features = MAX_FEATURES
         if camera.frames is not None:
             options.sift.max_num_features, options.sift.peak_threshold = BACKGROUND_FEATURES, BACKGROUND_PEAK
-        reader.existing_camera_id = _camera_of(database, camera.names[0])
+        reader.existing_camera_id = _camera_of(database, camera.names)
         for names in _batches(all_names, BATCH):
             report("features", done, total)
             mode = pycolmap.CameraMode.SINGLE
             pycolmap.extract_features(database, Path(camera.folder), list(names), mode, reader, options)
             if reader.existing_camera_id < 0:
-                reader.existing_camera_id = _camera_of(database, camera.names[0])
+                reader.existing_camera_id = _camera_of(database, camera.names)
             done += len(names)
     report("features", total, total)
 
@@ -87,10 +87,11 @@ def only_fixed(job: PosesJob) -> bool:
     return all(camera.frames is not None for camera in job.cameras)
 
 
-def _camera_of(database: Path, name: str) -> int:
+def _camera_of(database: Path, names: Sequence[str]) -> int:
+    """The camera of the first of these images that could be read; -1 if none could."""
     with pycolmap.Database.open(database) as opened:
-        image = opened.read_image_with_name(name)
-    return image.camera_id if image is not None else -1
+        images = (opened.read_image_with_name(name) for name in names)
+        return next((image.camera_id for image in images if image is not None), -1)
 
 
 def _batches(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:

@@ -40,9 +40,9 @@ class PosesJob:
     workspace: str
     cameras: tuple[CameraViews, ...]
     pairs: tuple[tuple[str, str], ...]
-    """Images of the model to match."""
+    """Of the model's images, which are matched."""
     other_pairs: tuple[tuple[str, str], ...]
-    """Images that are registered to it, and those of it to match them with."""
+    """Of another image and one of the model, which are matched."""
     seed: int
     threads: int
     """-1: all processors."""

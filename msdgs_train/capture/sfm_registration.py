@@ -12,7 +12,7 @@ from msdgs_train.capture.sfm_process import PosesJob
 from msdgs_train.capture.sfm_report import report
 
 MIN_INLIERS, MIN_INLIER_PART = 30, 0.25
-"""Of a pose's points, as COLMAP's mapper has them."""
+"""Least inliers of a pose, and their least share of its points; defaults of COLMAP's mapper."""
 
 
 def register_others(model: pycolmap.Reconstruction, job: PosesJob, database: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from msdgs_serve.writing import replacing
 
 GEOMETRY = "geometry.npz"
-FORMAT = 2
+FORMAT = 3
 """Of that file; a step that made another one runs again."""
 BUNDLE = 8
 """Observing cameras of a point among which its largest parallax is searched."""
@@ -26,9 +26,9 @@ class Summary:
     observations: np.ndarray  # [M, 2] int64: image, point
     error: float  # mean reprojection error of the points in pixels
     method: str  # "incremental" or "global"
-    others: tuple[int, ...]  # images of the other models
-    beyond_rotation: float  # pixels of the motion between images that no rotation of the camera explains
-    agreement: float  # observations relative to the features that are found again in several images
+    others: tuple[int, ...]  # keyframes of the other models
+    beyond_rotation: float  # pixels of the motion between keyframes that no rotation of the camera explains
+    agreement: float  # observations of keyframes relative to their features that are found again in several ones
 
     def save(self, file: Path) -> None:
         """Write it as NPZ."""

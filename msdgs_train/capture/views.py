@@ -34,7 +34,8 @@ class View:
 
 
 def matched_pairs(views: Sequence[View]) -> list[tuple[str, str]]:
-    """Names of the views to match: neighbors, keyframes, and views of one time across cameras."""
+    """Names of the views to match: neighbors, views at even distances, and views of about one time across
+    cameras."""
     cameras = _by_camera(views)
     pairs = [pair for own in cameras for pair in _own_pairs(own)]
     pairs += [pair for one, other in combinations(cameras, 2) for pair in _cross_pairs(one, other)]

@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import onnx
@@ -26,6 +27,7 @@ from msdgs_export.measure.poses import posed
 from msdgs_export.measure.views import cameras_of
 from msdgs_export.options import ConvertOptions, ExportOptions, Kept
 from msdgs_export.plans.registry import build
+from msdgs_export.storage import choice
 from msdgs_export.storage.choice import COARSEST, GROUPS, fewest_bytes, packed, smallest_error
 from msdgs_export.storage.kinds import Pack, directions, fractions, in_range, logarithms, low_rank
 from msdgs_export.trajectories.sampling import Trajectories
@@ -192,11 +194,14 @@ def test_a_scene_file_is_stored_anew(tmp_path: Path, kind: str, count: int, monk
     """The worst of other frames has about the stated PSNR, too. Kinds of the last are chosen by every second
     Gaussian."""
     monkeypatch.setattr(packing, "SAMPLE", 600)
+    thinned = Mock(side_effect=packing._thinned)
+    monkeypatch.setattr(packing, "_thinned", thinned)
     scene, out = tmp_path / "scene.onnx", tmp_path / "small.onnx"
     contents = build("network", bake(random_model(count, **MODELS[kind]), SCENE, "0" * 64))
     set_properties(contents, measured_error={"means": 0.25, "rendered": {"psnr_worst": 70.0}})
     scene.write_bytes(contents.SerializeToString())
     assert convert_main(ConvertOptions(scene, out, min_psnr=40.0)) == 0
+    assert thinned.called == (count > packing.SAMPLE)
     exact, small = DeformationSession(scene), DeformationSession(out)
     metadata = small.scene.metadata
     (entry,) = (each for each in metadata.left_out if each["rule"] == "float32")
@@ -213,6 +218,16 @@ def test_a_scene_file_is_stored_anew(tmp_path: Path, kind: str, count: int, monk
     scene.write_bytes(build("network", bake(random_model(1, layers=()), SCENE, "0" * 64)).SerializeToString())
     assert convert_main(ConvertOptions(scene, out)) == EXIT_INVALID  # all arrays are small
     assert out.read_bytes() == before
+
+
+def test_a_file_of_too_many_values_is_not_stored_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(choice, "MAX_VALUES", 1000)
+    monkeypatch.setattr(packing, "SAMPLE", 50)
+    scene, out = tmp_path / "scene.onnx", tmp_path / "small.onnx"
+    contents = build("network", bake(random_model(400, **MODELS["still"]), SCENE, "0" * 64))
+    scene.write_bytes(contents.SerializeToString())
+    assert convert_main(ConvertOptions(scene, out)) == EXIT_INVALID
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("name", ["frames.scales", "sizes"])

@@ -2,9 +2,9 @@
 
 python -m tests.rasterizer.frames_elsewhere FILE
 
-The command draws random and adversarial scenes with all options. Without FILE, an NPZ, it writes the frames; with it,
-it compares them, and the exit status is 1 if one is further away than the bound in tests/support/tolerances.py. Colors
-are clipped to [0, 1].
+The command draws random and adversarial scenes with all options. If FILE doesn't exist, it writes the frames to it as
+NPZ; otherwise it compares them, with colors clipped to [0, 1], and the exit status is 1 if the PSNR of one is below the
+bound in tests/support/tolerances.py.
 """
 
 import platform
@@ -35,15 +35,23 @@ def main(file: Path) -> int:
     """Write or compare."""
     drawn = frames()
     if not file.exists():
-        np.savez_compressed(file, **drawn)  # pyright: ignore[reportArgumentType]
+        with file.open("wb") as written:
+            np.savez_compressed(written, **drawn)  # pyright: ignore[reportArgumentType]
         print(f"{len(drawn)} frames of {platform.machine()} written to {file}")
         return 0
     with np.load(file) as others:
-        errors = {name: np.clip(frame, 0, 1) - np.clip(others[name], 0, 1) for name, frame in drawn.items()}
-    decibels = {name: -10 * np.log10(np.mean(error**2) + 1e-20) for name, error in errors.items()}
+        assert others.files == [*drawn]
+        decibels = {name: psnr(frame, others[name]) for name, frame in drawn.items()}
     worst = min(decibels, key=lambda name: decibels[name])
     print(f"{len(drawn)} frames of {platform.machine()}: {decibels[worst]:.1f} dB or more ({worst})")
     return int(decibels[worst] < tolerance("frames.other_processor"))
+
+
+def psnr(frame: np.ndarray, other: np.ndarray) -> float:
+    """PSNR in dB of two images of finite colors, at most 200."""
+    assert np.isfinite(frame).all()
+    assert np.isfinite(other).all()
+    return -10 * np.log10(np.mean((np.clip(frame, 0, 1) - np.clip(other, 0, 1)) ** 2) + 1e-20)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def draw_plainly(
 
 def gradients(drawn: tuple[torch.Tensor, torch.Tensor], loss: Loss, p: Parameters) -> dict[str, np.ndarray]:
     grads = torch.autograd.grad(loss(*drawn), p, allow_unused=True, materialize_grads=True)
-    return {kind: grad.numpy() for kind, grad in zip(KINDS, grads, strict=True)}
+    return {kind: grad.detach().numpy() for kind, grad in zip(KINDS, grads, strict=True)}
 
 
 def weighted(pixels: np.ndarray, seed: int = 0) -> Loss:

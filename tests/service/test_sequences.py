@@ -22,7 +22,7 @@ VERSIONS = [
     {"background": (0.5, 0.25, 0.0), "steps": True, "static_color": (0.0, 0.0, 1.0)},
     {"background": (1.0, 1.0, 1.0), "steps": True, "moving": 2},
 ]
-"""What the scene's file is replaced by; of the last, too much moves for frames that follow one another."""
+"""Of the scene's file. In the last, more Gaussians move than a frame sequence allows."""
 
 requests = st.fixed_dictionaries(
     {
@@ -67,6 +67,7 @@ def services(folder: Path, renderer: Renderer) -> Iterator[list[httpx.Client]]:
 def test_no_frame_differs_from_a_fresh_one(folder: Path, renderer: Renderer, services: list[httpx.Client]):
     @given(actions)
     def compare(sequence: list[dict[str, Any] | int]):
+        replace_scene(folder, VERSIONS[0], services)
         for action in sequence:
             if isinstance(action, int):
                 replace_scene(folder, VERSIONS[action], services)
