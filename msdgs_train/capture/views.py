@@ -15,8 +15,8 @@ REVISITS = 24
 LINKS = 40
 """Frames of a moving camera that are matched with those of another camera."""
 KEYFRAMES = 100
-"""Frames of a moving camera that a model is made of. In a model of all 300 frames of an arc of 60°, what moves little
-between neighbors passes for what stands still: the largest error of centers is 12 % of their extent, not 0.07 %."""
+"""Frames of a moving camera that a model is made of. Of 300 frames of 1024 pixels these are mapped in 20 seconds, all
+in more than ten minutes."""
 NEAREST = 2
 """Keyframes before and after another frame that it is matched with."""
 
