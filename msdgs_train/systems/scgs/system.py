@@ -112,7 +112,7 @@ class SCGS(GaussianSplatting):
 
     @torch.no_grad()
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
-        self.step = steps[-1]
+        self.step = steps.stop - 1  # none may have been reached
         if not self.is_second and round(self.settings.node_choice_fraction * self.first_steps) in steps:
             self._choose_nodes(optimizer)
         if not self.is_second and self.first_steps in steps:

@@ -115,6 +115,9 @@ def test_each_preset_trains(name: str, data: Path) -> None:
         unchanged = {n for n, p in deformation.named_parameters() if torch.equal(before[n], p)}
         assert trainer.schedule.deforms(step) or unchanged == before.keys()
     assert not unchanged
+    for advance in (0, 1):  # a slow schedule, as of --minutes
+        trainer.step(advance)
+    assert trainer.step_count == step + 2
 
 
 @pytest.mark.parametrize(
