@@ -6,7 +6,6 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from enum import Enum
-from functools import cache
 from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +22,7 @@ from msdgs_serve.api.settings import Settings
 from msdgs_serve.api.uploads import Uploads
 from msdgs_serve.api.work import WorkQueue
 from msdgs_serve.imaging import encode
-from msdgs_serve.rasterizer.precompile import draw_tiny_frames
+from msdgs_serve.rasterizer.precompile import load_kernels
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid
 from msdgs_serve.store import SceneStore, ServedScene
@@ -140,7 +139,7 @@ class Service:
     def _warm_up(self) -> None:
         """Load the scenes given as files and meanwhile the kernels, and render a small frame of any scene."""
         files = [path.stem for path in self.settings.scenes if path.is_file()]
-        kernels = threading.Thread(target=_load_kernels, daemon=True)  # a scene of 1 GB is ready 0.6 s earlier
+        kernels = threading.Thread(target=load_kernels, daemon=True)  # a scene of 1 GB is ready 0.6 s earlier
         kernels.start()
         for name in files:
             self.store.get(name)
@@ -171,12 +170,6 @@ class Service:
                 self.store.clear_incoming()
         except Exception:
             logger.exception("refreshing the scenes failed")
-
-
-@cache
-def _load_kernels() -> None:
-    """Load the kernels, or compile them, once for all services of the process."""
-    draw_tiny_frames()
 
 
 async def _service(request: Request) -> Service:

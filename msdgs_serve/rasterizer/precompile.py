@@ -27,7 +27,7 @@ class KernelsNotStored(MsdgsError):
 
 
 def compile_kernels() -> Path:
-    """Compile every kernel of `rasterize` and store it on disk.
+    """Draw tiny float32 frames, so that every kernel of `rasterize` is compiled and stored on disk.
 
     The kernels serve all cameras and scenes on processors of this kind. Return the folder in which they are. Raises
     `KernelsNotStored`.
@@ -39,23 +39,24 @@ def compile_kernels() -> Path:
         raise KernelsNotStored(
             f"compiled kernels are stored in {folder}, which can't be written; set NUMBA_CACHE_DIR to another folder"
         )
-    draw_tiny_frames()
-    return folder
-
-
-def draw_tiny_frames() -> None:
-    """Draw float32 frames that need all kernels: they are loaded, or compiled and stored. Without the compiler there
-    are none, and frames would take minutes."""
-    if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
-        return
-    pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
     for count in COUNTS:
-        camera = Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose)
         gaussians = _gaussians(count)
         static = static_bounds(0, gaussians.means, gaussians.scales)
         for more in (False, True):
-            rasterize(gaussians, camera, depth=more, counts=more, static=static)
-            FrameSequence(gaussians, count, camera, depth=more).frame(gaussians)
+            rasterize(gaussians, _camera(), depth=more, counts=more, static=static)
+            FrameSequence(gaussians, count, _camera(), depth=more).frame(gaussians)
+    return folder
+
+
+def load_kernels() -> None:
+    """Load numba's modules and the kernels of the first frame, which are compiled if they aren't stored."""
+    gaussians = _gaussians(COUNTS[0])
+    rasterize(gaussians, _camera(), static=static_bounds(0, gaussians.means, gaussians.scales))
+
+
+def _camera() -> Camera:
+    pose = look_at(np.array([0.0, 0.0, -4.0]), np.zeros(3), np.array([0.0, -1.0, 0.0]))
+    return Camera(SIZE, SIZE, SIZE / 2, SIZE / 2, SIZE, SIZE, pose)
 
 
 def _gaussians(count: int) -> Gaussians:
