@@ -82,7 +82,7 @@ def find_poses(
         for camera, own in enumerate(names)
         if own
     )
-    pairs, other_pairs = tuple(matched_pairs(keys)), tuple(pairs_with_keyframes(views))
+    pairs, other_pairs = tuple(matched_pairs(keys)), tuple(pairs_with_keyframes(views, keys))
     job = PosesJob(str(workspace), cameras, pairs, other_pairs, seed, threads or ALL_PROCESSORS, all_matches)
     run_sfm(job, images, progress)
     return Poses.load(workspace, frames)

@@ -48,16 +48,16 @@ def keyframes(views: Sequence[View]) -> list[View]:
     return [view for view in views if view in chosen]
 
 
-def pairs_with_keyframes(views: Sequence[View]) -> list[tuple[str, str]]:
-    """Names of each view that is no keyframe, and of the keyframes of its camera around it."""
-    chosen, pairs = set(keyframes(views)), []
+def pairs_with_keyframes(views: Sequence[View], keys: Sequence[View]) -> list[tuple[str, str]]:
+    """Names of each view that is not among the keyframes `keys`, and of those of its camera around it."""
+    chosen, pairs = set(keys), []
     for own in _by_camera(views):
-        keys = [index for index, view in enumerate(own) if view in chosen]
+        places = [index for index, view in enumerate(own) if view in chosen]
         for index, view in enumerate(own):
             if view not in chosen:
-                after = bisect(keys, index)
-                around = keys[max(after - NEAREST, 0) : after + NEAREST]
-                pairs += [(view.name, own[key].name) for key in around]
+                after = bisect(places, index)
+                around = places[max(after - NEAREST, 0) : after + NEAREST]
+                pairs += [(view.name, own[place].name) for place in around]
     return pairs
 
 

@@ -49,7 +49,7 @@ class System(Protocol):
 
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
         """Called before an optimizer step. `steps` of the schedule, counted from 0, have been reached since the last
-        one: one, unless the schedule follows the clock."""
+        one: one, or if the schedule follows the clock, several or none."""
         ...
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:

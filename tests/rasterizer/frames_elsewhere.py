@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.measuring import psnr
 from msdgs_serve.rasterizer import rasterize
 from tests.support.scenes import ADVERSARIAL, OPTIONS, Scene, random_scene
 from tests.support.tolerances import tolerance
@@ -41,17 +42,11 @@ def main(file: Path) -> int:
         return 0
     with np.load(file) as others:
         assert others.files == [*drawn]
+        assert all(np.isfinite(each[name]).all() for each in (drawn, others) for name in drawn)
         decibels = {name: psnr(frame, others[name]) for name, frame in drawn.items()}
     worst = min(decibels, key=lambda name: decibels[name])
     print(f"{len(drawn)} frames of {platform.machine()}: {decibels[worst]:.1f} dB or more ({worst})")
     return int(decibels[worst] < tolerance("frames.other_processor"))
-
-
-def psnr(frame: np.ndarray, other: np.ndarray) -> float:
-    """PSNR in dB of two images of finite colors, at most 200."""
-    assert np.isfinite(frame).all()
-    assert np.isfinite(other).all()
-    return -10 * np.log10(np.mean((np.clip(frame, 0, 1) - np.clip(other, 0, 1)) ** 2) + 1e-20)
 
 
 if __name__ == "__main__":

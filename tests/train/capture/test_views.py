@@ -21,7 +21,8 @@ def test_keyframes_are_spread_over_each_camera():
 
 
 def test_other_frames_are_matched_with_keyframes_of_their_camera_around_them():
-    pairs = pairs_with_keyframes([*MOVING, *FEW, BACKGROUND])
+    views = [*MOVING, *FEW, BACKGROUND]
+    pairs = pairs_with_keyframes(views, keyframes(views))
     others = [view.name for view in MOVING if view not in MOVING[::4]]
     assert [*dict.fromkeys(name for name, _ in pairs)] == others
     of_sixth = [key for name, key in pairs if name == MOVING[6].name]
@@ -33,5 +34,5 @@ def test_other_frames_are_matched_with_keyframes_of_their_camera_around_them():
 
 def test_without_other_frames_there_are_no_such_pairs():
     assert keyframes(FEW) == FEW
-    assert pairs_with_keyframes(FEW) == []
+    assert pairs_with_keyframes(FEW, FEW) == []
     assert len(matched_pairs(FEW)) == 3
