@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measuring import psnr
 from msdgs_serve.rasterizer import rasterize
+from tests.support.images import psnr
 from tests.support.scenes import ADVERSARIAL, OPTIONS, Scene, random_scene
 from tests.support.tolerances import tolerance
 
@@ -40,10 +40,10 @@ def main(file: Path) -> int:
             np.savez_compressed(written, **drawn)  # pyright: ignore[reportArgumentType]
         print(f"{len(drawn)} frames of {platform.machine()} written to {file}")
         return 0
-    with np.load(file) as others:
+    with np.load(file) as others, np.errstate(divide="ignore"):  # of equal frames
         assert others.files == [*drawn]
         assert all(np.isfinite(each[name]).all() for each in (drawn, others) for name in drawn)
-        decibels = {name: psnr(frame, others[name]) for name, frame in drawn.items()}
+        decibels = {name: psnr(np.clip(frame, 0, 1), np.clip(others[name], 0, 1)) for name, frame in drawn.items()}
     worst = min(decibels, key=lambda name: decibels[name])
     print(f"{len(drawn)} frames of {platform.machine()}: {decibels[worst]:.1f} dB or more ({worst})")
     return int(decibels[worst] < tolerance("frames.other_processor"))
