@@ -33,6 +33,15 @@ COMMANDS = {
 
 
 @pytest.mark.slow
+def test_help_ends_without_warnings_of_libraries():
+    shown = subprocess.run(
+        [sys.executable, "-m", "msdgs_train", "fit", "--help"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert "--preset" in shown.stdout
+    assert shown.stderr == ""
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "arguments", "package"),
     [

@@ -121,7 +121,7 @@ def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
     return np.diff(sums[below] + cut, axis=0) * (count / length)
 
 
-def _open(path: Path) -> oiio.ImageInput:
+def _open(path: Path) -> "oiio.ImageInput":  # quoted, or OpenImageIO's bindings report leaks after `--help`
     straight = oiio.ImageSpec()
     straight.attribute("oiio:UnassociatedAlpha", 1)
     reader = oiio.ImageInput.open(str(path), straight)
