@@ -20,7 +20,7 @@ FUZZERS := tests/service/test_openapi.py tests/service/test_hostile_uploads.py t
 	tests/frames/test_blocks.py tests/rasterizer/test_rasterizer_stress.py
 BENCHMARKS := rasterizer rasterizer.renderers rasterizer.constants rasterizer.parts rasterizer.still_camera \
 	rasterizer.avx512 service.scaling training.training_step training.gpu_step training.known_motion \
-	training.k_steps training.realistic paper export.imported_formats export.paper_sized \
+	training.k_steps training.realistic training.static_oracle paper export.imported_formats export.paper_sized \
 	export.nodes export.scene_file export.large_import capture.capture_truth capture.duration browser
 INSTALL := -m pip --disable-pip-version-check install --no-compile
 # the same pins for what is installed and for what builds the package
