@@ -47,7 +47,7 @@ def from_plain(field: str, value: Any, kinds: Mapping[str, type[P]]) -> P:
 
 
 def parse(field: str, text: Any) -> dict[str, Any]:
-    """`kind:name=value,name=value` as plain values; values are Python literals."""
+    """`kind:name=value,name=value` as plain values; values are Python literals, or words without quotes."""
     if not isinstance(text, str):
         raise InvalidInput(field, "a kind with its settings, as in mlp:width=96", text)
     kind, _, rest = text.partition(":")
@@ -59,7 +59,8 @@ def parse(field: str, text: Any) -> dict[str, Any]:
             raise ValueError("a value without a name")
         for keyword in call.keywords:
             assert keyword.arg is not None
-            settings[keyword.arg] = ast.literal_eval(keyword.value)
+            word = isinstance(keyword.value, ast.Name)
+            settings[keyword.arg] = keyword.value.id if word else ast.literal_eval(keyword.value)
     except (SyntaxError, ValueError, AssertionError) as error:
         raise InvalidInput(field, "a kind with its settings, as in mlp:width=96,depth=2", text) from error
     return settings
