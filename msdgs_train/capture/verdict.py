@@ -18,10 +18,10 @@ MIN_REGISTERED, FEW_REGISTERED = 0.5, 0.95
 """Shares of frames with poses."""
 MIN_WHOLE = 0.75
 """The same, where poses break off."""
-MIN_BEYOND_ROTATION, LEAST_PIXELS = 1 / 1000, 0.65
+MIN_BEYOND_ROTATION, LEAST_PIXELS = 1 / 1000, 0.5
 """In longer sides of the frames, and in pixels at least, as matches are no better."""
 MIN_AGREEMENT = 0.4
-"""Of the features of moving cameras that are found again, as observations of points: 0.9 and more with right poses, and
+"""Of the features of moving cameras that are found again, as observations of points: 0.7 and more with right poses, and
 0.3 at most with wrong ones."""
 MIN_SEEN = 15
 """Points that a frame sees, for poses that are more than guesses."""
