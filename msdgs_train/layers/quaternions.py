@@ -40,18 +40,18 @@ class _Unit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor) -> Tensor:
+        ctx.save_for_backward(raw)
         array = to_array(raw)
-        units, norms = np.empty_like(array), np.empty(len(array), array.dtype)
-        unit_forward(array, units, norms)
-        ctx.kept = units, norms
+        units = np.empty_like(array)
+        unit_forward(array, units)
         return torch.from_numpy(units).to(raw.device)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
-        units, norms = ctx.kept
-        grad_raw = np.empty_like(units)
-        unit_backward(units, norms, to_array(grad), grad_raw)
+        raw = to_array(ctx.saved_tensors[0])
+        grad_raw = np.empty_like(raw)
+        unit_backward(raw, to_array(grad), grad_raw)
         return torch.from_numpy(grad_raw).to(grad.device)
 
 

@@ -100,9 +100,7 @@ class NodesSupport(Support):
 
     def follow(self, gaussians: CanonicalPoints, motions: Tensor) -> Deltas:
         weights = skinning_weights(gaussians.attributes["skinning_logits"])
-        columns = skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions)
-        means, scales, quats = columns.split((3, 3, 4), dim=1)
-        return Deltas(means, scales, quats)
+        return Deltas(*skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions))
 
     def points(self, means: Tensor) -> Tensor:
         return self.nodes
