@@ -30,21 +30,23 @@ def loss_sums_and_gradient(
     x: np.ndarray, y: np.ndarray, taps: tuple[float, ...], weights: tuple[float, float, float], gradient: np.ndarray
 ) -> np.ndarray:
     """Return the sums of |x - y|, (x - y)² and SSIM over images [H, W * 3], and write the gradient in x, of the same
-    shape, of these sums times `weights`. `taps` are the first six of the window, which is symmetric."""
+    shape, of these sums times `weights`; SSIM is 0 if its weight is. `taps` are the first six of the window, which is
+    symmetric."""
     height, width = x.shape
     lanes = (width + NUM_LANES - 1) // NUM_LANES * NUM_LANES
     maps, slopes = np.zeros((ROWS, 4, lanes), x.dtype), np.zeros((ROWS, 3, lanes), x.dtype)
     wide, pixels = np.zeros((4, lanes + 2 * MARGIN), x.dtype), np.zeros((2, lanes), x.dtype)
     wide_slopes, out, sums = np.zeros_like(wide[:3]), np.zeros(lanes, x.dtype), np.zeros((3, lanes), x.dtype)
+    compares = weights[2] != 0
     for row in range(height + 2 * RADIUS):
-        if row < height:
+        if compares and row < height:
             wide[0, MARGIN : MARGIN + width], wide[1, MARGIN : MARGIN + width] = x[row], y[row]
             _multiply(wide)
             _blur_rows(wide, taps, maps[row % ROWS])
         else:
             maps[row % ROWS] = 0
         middle = row - RADIUS
-        if 0 <= middle < height:
+        if compares and 0 <= middle < height:
             _compare(maps, _rows_around(middle, 4 * lanes), taps, wide_slopes, sums[2])
             wide_slopes[:, MARGIN + width :] = 0
             _blur_rows(wide_slopes, taps, slopes[middle % ROWS])
