@@ -70,7 +70,7 @@ class CurveLayer(DeformationLayer):
         """[C, ·] of curves, [knots + 3, C, ·], at one time."""
         read, part = self.knots_at(t)
         weights = cubic_weights(part)
-        return [torch.einsum("k,kbc->bc", weights, curve[read]) for curve in curves]
+        return [(weights @ curve[read].flatten(1)).unflatten(0, curve.shape[1:]) for curve in curves]
 
     def unsteadiness(self, t: Tensor, *curves: Tensor) -> list[Tensor]:
         """Mean absolute second difference along time of the four knots around a time, of each curve."""
@@ -96,17 +96,17 @@ class CurveLayer(DeformationLayer):
         """
         knots = self.num_knots
         known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
-        for last, direction in ((known[0], -1), (known[-1], 1)):
-            rot, inner = (unit(self.rots[k]) for k in (last, last - direction))
-            step = multiply(rot, inner * rot.new_tensor([1.0, -1.0, -1.0, -1.0]))
-            beyond = slice(last + 1, None) if direction > 0 else slice(0, last)
-            turned = range(knots + 3)[beyond][::direction][:3]  # knots that times within the window read
-            rots = [rot := unit(multiply(step, rot)) for _ in turned]
-            for curve in self.held_curves:
-                curve[beyond] = curve[last]
-            self.rots[beyond] = self.rot_lengths * rot
-            for k, each in zip(turned, rots, strict=True):
-                self.rots[k] = self.rot_lengths * each
+        first, last = known[0], known[-1]
+        for curve in self.held_curves:
+            curve[:first], curve[last + 1 :] = curve[first], curve[last]
+        # of both ends at once, [2 C, 4]
+        rot, inner = (unit(self.rots[ends].flatten(0, 1)) for ends in ([first, last], [first + 1, last - 1]))
+        step = multiply(rot, inner * rot.new_tensor([1.0, -1.0, -1.0, -1.0]))
+        for turned in range(3):  # knots that times within the window read; those farther away are as the third
+            rot = unit(multiply(step, rot))
+            below, above = rot.unflatten(0, (2, -1))
+            self.rots[: max(first - turned, 0)] = self.rot_lengths * below
+            self.rots[last + 1 + turned :] = self.rot_lengths * above
 
 
 def cubic_weights(part: Tensor) -> Tensor:

@@ -1,32 +1,43 @@
-"""Kernels that scale quaternions to unit length, and their gradients."""
-
-import math
+"""Kernels that scale quaternions to unit length, and their gradients; 16 at a time."""
 
 import numpy as np
 
-from msdgs_serve.rasterizer.jit import kernel
+from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
+from msdgs_serve.rasterizer.simd.memory import load_four_columns, store_columns
+from msdgs_serve.rasterizer.simd.types import NUM_LANES, Vector
+from msdgs_serve.rasterizer.simd.vectors import filled, select, square_root
 from msdgs_serve.scene.quaternion import MIN_NORM
 
 
 @kernel
-def unit_forward(raw: np.ndarray, units: np.ndarray, norms: np.ndarray) -> None:
-    """Write [N, 4] quaternions of unit length, or the identity if `raw` has no direction, and the norms, [N]."""
-    for n in range(np.uint64(len(raw))):
-        w, x, y, z = raw[n, 0], raw[n, 1], raw[n, 2], raw[n, 3]
-        norm = math.sqrt(w * w + x * x + y * y + z * z)
-        norms[n] = norm
-        if norm < MIN_NORM:
-            w, x, y, z, norm = raw.dtype.type(1), 0 * x, 0 * y, 0 * z, raw.dtype.type(1)
-        units[n, 0], units[n, 1], units[n, 2], units[n, 3] = w / norm, x / norm, y / norm, z / norm
+def unit_forward(raw: np.ndarray, units: np.ndarray) -> None:
+    """Write [N, 4] quaternions of unit length, or the identity if `raw` has no direction."""
+    for first in range(0, len(raw), NUM_LANES):
+        w, x, y, z = load_four_columns(raw, first, 0)
+        factor = _inverse_norm(w, x, y, z)
+        w = select(factor > 0, factor * w, filled(1, w))
+        store_columns(units, first, 0, (w, factor * x, factor * y, factor * z))
 
 
 @kernel
-def unit_backward(units: np.ndarray, norms: np.ndarray, grads: np.ndarray, grad_raw: np.ndarray) -> None:
+def unit_backward(raw: np.ndarray, grads: np.ndarray, grad_raw: np.ndarray) -> None:
     """Write the gradients of the quaternions before scaling, [N, 4]; 0 for those that became the identity."""
-    for n in range(np.uint64(len(units))):
-        radial = grads.dtype.type(0)
-        for i in range(4):
-            radial += units[n, i] * grads[n, i]
-        factor = 1 / norms[n] if norms[n] >= MIN_NORM else 0 * norms[n]
-        for i in range(4):
-            grad_raw[n, i] = factor * (grads[n, i] - radial * units[n, i])
+    for first in range(0, len(raw), NUM_LANES):
+        w, x, y, z = load_four_columns(raw, first, 0)
+        a, b, c, d = load_four_columns(grads, first, 0)
+        factor = _inverse_norm(w, x, y, z)
+        radial = factor * factor * (w * a + x * b + y * c + z * d)
+        columns = (a - radial * w, b - radial * x, c - radial * y, d - radial * z)
+        store_columns(
+            grad_raw,
+            first,
+            0,
+            (factor * columns[0], factor * columns[1], factor * columns[2], factor * columns[3]),
+        )
+
+
+@inlined_kernel
+def _inverse_norm(w: Vector, x: Vector, y: Vector, z: Vector) -> Vector:
+    """One over the norms of quaternions, 0 for those that have no direction."""
+    norm = square_root(w * w + x * x + y * y + z * z)
+    return select(norm < MIN_NORM, filled(0, norm), 1 / norm)

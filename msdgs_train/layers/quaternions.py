@@ -25,8 +25,8 @@ def unit_or_identity(raw_quats: Tensor) -> Tensor:
 
 
 def identity_like(quats: Tensor) -> Tensor:
-    """[1, 4] the identity, made on the device: a copy from the CPU would wait for it."""
-    return torch.eye(1, 4, dtype=quats.dtype, device=quats.device)
+    """[1, 4] the identity; don't write to it."""
+    return _identity(1, 4, quats.dtype, quats.device)
 
 
 def _unit_or_identity(raw: Tensor) -> Tensor:
@@ -40,18 +40,18 @@ class _Unit(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, raw: Tensor) -> Tensor:
+        ctx.save_for_backward(raw)
         array = to_array(raw)
-        units, norms = np.empty_like(array), np.empty(len(array), array.dtype)
-        unit_forward(array, units, norms)
-        ctx.kept = units, norms
+        units = np.empty_like(array)
+        unit_forward(array, units)
         return torch.from_numpy(units).to(raw.device)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
-        units, norms = ctx.kept
-        grad_raw = np.empty_like(units)
-        unit_backward(units, norms, to_array(grad), grad_raw)
+        raw = to_array(ctx.saved_tensors[0])
+        grad_raw = np.empty_like(raw)
+        unit_backward(raw, to_array(grad), grad_raw)
         return torch.from_numpy(grad_raw).to(grad.device)
 
 
@@ -72,8 +72,13 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
 def rotation_matrices(quats: Tensor) -> Tensor:
     """[N, 3, 3] of unit quaternions."""
     products = (quats[:, :, None] * quats[:, None]).flatten(1)
-    identity = torch.eye(3, dtype=quats.dtype, device=quats.device).flatten()
+    identity = _identity(3, 3, quats.dtype, quats.device).flatten()
     return torch.addmm(identity, products, _product_terms(quats.dtype, quats.device)).unflatten(1, (3, 3))
+
+
+@cache
+def _identity(rows: int, columns: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.eye(rows, columns, dtype=dtype, device=device)
 
 
 @cache
@@ -88,8 +93,13 @@ def _product_terms(dtype: torch.dtype, device: torch.device) -> Tensor:
 
 def stretch_matrices(stretches: Tensor) -> Tensor:
     """[N, 3, 3] the identity plus symmetric matrices of xx, yy, zz, xy, xz, yz, [N, 6], or diagonal ones, [N, 3]."""
-    if stretches.shape[1] == 3:
-        return torch.diag_embed(1 + stretches)
-    xx, yy, zz, xy, xz, yz = stretches.unbind(dim=1)
-    rows = ((1 + xx, xy, xz), (xy, 1 + yy, yz), (xz, yz, 1 + zz))
-    return torch.stack([torch.stack(row, dim=1) for row in rows], dim=1)
+    dtype, device = stretches.dtype, stretches.device
+    terms = _stretch_terms(dtype, device)[: stretches.shape[1]]
+    return torch.addmm(_identity(3, 3, dtype, device).flatten(), stretches, terms).unflatten(1, (3, 3))
+
+
+@cache
+def _stretch_terms(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """[6, 9] where the six numbers of a symmetric matrix are in it."""
+    places = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
+    return torch.from_numpy(np.eye(6)[:, places.flatten()]).to(device, dtype)

@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
-from msdgs_train.losses.kernels import TAPS, error_sums, loss_gradient, ssim_sum_and_derivatives
+from msdgs_train.losses.kernels import RADIUS, TAPS, loss_sums_and_gradient
 from msdgs_train.losses.torch_photometric import TorchPhotometric
 
 MSE_SCALE = 4.0
@@ -76,16 +76,13 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rgb: Tensor, target: Tensor, l1: float, mse: float, dssim: float) -> Tensor:
         x, y = (to_array(image).reshape(len(image), -1) for image in (rgb, target))
-        taps = TAPS.astype(x.dtype)
-        absolute, square = error_sums(x, y)
-        similarity, derivatives = ssim_sum_and_derivatives(x, y, taps) if dssim else (0.0, np.empty((0, 0, 0), x.dtype))
-        ctx.kept = (x, y, taps, derivatives, (l1 / x.size, 2 * mse / x.size, -dssim / x.size), rgb.shape, rgb.device)
-        total = (l1 * absolute + mse * square - dssim * similarity) / x.size + dssim
-        return torch.tensor(total, dtype=rgb.dtype, device=rgb.device)
+        gradient, taps = np.empty_like(x), tuple(TAPS[: RADIUS + 1].astype(x.dtype))
+        weights = l1 / x.size, mse / x.size, -dssim / x.size
+        sums = loss_sums_and_gradient(x, y, taps, weights, gradient)
+        ctx.save_for_backward(torch.from_numpy(gradient).reshape(rgb.shape).to(rgb.device))
+        return torch.tensor(sums @ weights + dssim, dtype=rgb.dtype, device=rgb.device)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        *arrays, factors, shape, device = ctx.kept
-        gradient = loss_gradient(*arrays, tuple(float(grad) * factor for factor in factors))
-        return torch.from_numpy(gradient).reshape(shape).to(device), None, None, None, None
+        return grad * ctx.saved_tensors[0], None, None, None, None

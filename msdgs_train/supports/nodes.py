@@ -100,9 +100,7 @@ class NodesSupport(Support):
 
     def follow(self, gaussians: CanonicalPoints, motions: Tensor) -> Deltas:
         weights = skinning_weights(gaussians.attributes["skinning_logits"])
-        columns = skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions)
-        means, scales, quats = columns.split((3, 3, 4), dim=1)
-        return Deltas(means, scales, quats)
+        return Deltas(*skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions))
 
     def points(self, means: Tensor) -> Tensor:
         return self.nodes
@@ -114,7 +112,7 @@ class NodesSupport(Support):
         """[M, 16] matrices, offsets and quaternions of the nodes: x → matrix x + offset."""
         rots = unit(_quaternions(deltas))
         matrices = rotation_matrices(rots) @ stretch_matrices(deltas.scales)
-        offsets = self.nodes + deltas.means - torch.einsum("bij,bj->bi", matrices, self.nodes)
+        offsets = self.nodes + deltas.means - (matrices * self.nodes[:, None]).sum(dim=2)
         return torch.cat([matrices.flatten(1), offsets, rots], dim=1)
 
     @torch.no_grad()
@@ -158,10 +156,11 @@ class NodesSupport(Support):
         near = self.neighbors
         if not near.numel():  # one node
             return motions.new_zeros(())
-        own = torch.einsum("bij,bj->bi", matrices.view(-1, 3, 3), self.nodes) + offsets
-        moved = torch.einsum("bij,bkj->bki", matrices.view(-1, 3, 3), self.nodes[near]) + offsets[:, None]
-        lengths = torch.linalg.vector_norm(self.nodes[near] - self.nodes[:, None], dim=2)
-        return (torch.linalg.vector_norm(moved - own[near], dim=2) / (lengths + MIN_DISTANCE)).mean()
+        points = torch.cat([self.nodes[:, None], self.nodes[near]], dim=1)  # a node, then its neighbors
+        moved = torch.baddbmm(offsets[:, None], points, matrices.unflatten(1, (3, 3)).transpose(1, 2))
+        apart = moved[:, 1:] - moved[:, 0][near]
+        lengths = torch.linalg.vector_norm(points[:, 1:] - points[:, :1], dim=2)
+        return (torch.linalg.vector_norm(apart, dim=2) / (lengths + MIN_DISTANCE)).mean()
 
     def baked(self, gaussians: CanonicalPoints) -> dict[str, Any]:
         """`skinning_weights`, [N, F], whose rows sum to 1, and `node_ids`, int64 [N, F]."""

@@ -12,49 +12,50 @@ from msdgs_serve.threads import run_parallel
 from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.supports import torch_skinning
-from msdgs_train.supports.skinning_kernels import DELTAS, skin_backward, skin_forward
+from msdgs_train.supports.skinning_kernels import skin_backward, skin_forward
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
 
 
-def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Tensor) -> Tensor:
-    """Deltas of N Gaussians, [N, 10]: means 3, logarithms of scales 3, quaternions 4.
+def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Deltas of N Gaussians: of means and of logarithms of scales, [N, 3], and of quaternions, [N, 4].
 
     Args:
         means: [N, 3] canonical.
         quats: [N, 4] canonical, wxyz, unit.
-        weights: [N, F] skinning weights; rows sum to 1.
+        weights: [N, F] skinning weights, in memory best node by node; rows sum to 1.
         ids: [N, F] int64, of the nodes that each Gaussian follows.
         motions: [M, 16] of the nodes: matrix by rows, offset, unit quaternion.
     """
-    apply = _Skin.apply if arrays.has_kernels(means) else torch_skinning.skin
-    return apply(means, quats, weights, ids, motions)
+    if arrays.has_kernels(means):
+        return _Skin.apply(means, quats, weights.T, ids, motions)
+    return torch_skinning.skin(means, quats, weights, ids, motions)
 
 
 class _Skin(torch.autograd.Function):
     """Linear blend skinning by kernels; with torch's matrix products a training step takes 1.14 times as long."""
 
     @staticmethod
-    def forward(ctx: Any, *tensors: Tensor) -> Tensor:
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.save_for_backward(*tensors)
-        arrays = [to_array(tensor) for tensor in tensors]
-        deltas = np.empty((len(arrays[0]), DELTAS), arrays[0].dtype)
-        run_parallel(skin_forward, [(*arrays, *rows, deltas) for rows in _parts(len(deltas))])
-        return torch.from_numpy(deltas).to(tensors[0].device)
+        means, quats, *rest = (to_array(tensor) for tensor in tensors)
+        deltas = np.empty_like(means), np.empty_like(means), np.empty_like(quats)
+        run_parallel(skin_forward, [(means, quats, *rest, *rows, *deltas) for rows in _parts(len(means))])
+        return tuple(torch.from_numpy(array).to(tensors[0].device) for array in deltas)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         arrays = means, quats, weights, _, motions = [to_array(tensor) for tensor in ctx.saved_tensors]
         own = [np.empty_like(array) for array in (means, quats, weights)]
         parts = _parts(len(means))
         sums = np.zeros((len(parts), *motions.shape), motions.dtype)
-        grad_deltas = to_array(grad)
+        given = [to_array(grad) for grad in grads]
         run_parallel(
-            skin_backward, [(*arrays, grad_deltas, *rows, *own, part) for rows, part in zip(parts, sums, strict=True)]
+            skin_backward, [(*arrays, *given, *rows, *own, part) for rows, part in zip(parts, sums, strict=True)]
         )
         of_means, of_quats, of_weights, of_motions = (
-            torch.from_numpy(array).to(grad.device) for array in (*own, sums.sum(axis=0))
+            torch.from_numpy(array).to(grads[0].device) for array in (*own, sums.sum(axis=0))
         )
         return of_means, of_quats, of_weights, None, of_motions
 

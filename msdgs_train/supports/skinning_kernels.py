@@ -35,8 +35,6 @@ MOTION = 16
 """Numbers of a motion: matrix 9, offset 3, quaternion 4."""
 MIN_STRETCH = 0.05
 """Lower bound of the factor by which the axes of a Gaussian are stretched."""
-DELTAS = 10
-"""Columns of the deltas per Gaussian: mean 3, logarithms of scales 3, quaternion 4."""
 
 
 @kernel
@@ -48,11 +46,13 @@ def skin_forward(
     motions: np.ndarray,
     start: int,
     stop: int,
-    deltas: np.ndarray,
+    delta_means: np.ndarray,
+    delta_scales: np.ndarray,
+    delta_quats: np.ndarray,
 ) -> None:
-    """Write rows `start` to `stop` of deltas [N, DELTAS].
+    """Write rows `start` to `stop` of deltas of means and logarithms of scales, [N, 3], and quaternions, [N, 4].
 
-    Args: means [N, 3], quats [N, 4], weights and ids [N, F] of nodes, motions [M, MOTION].
+    Args: means [N, 3], quats [N, 4], weights [F, N] and ids [N, F] of nodes, motions [M, MOTION].
     """
     flat, blended = motions.reshape(-1), np.empty((NUM_LANES, MOTION), means.dtype)
     for first in range(start, stop, NUM_LANES):
@@ -61,21 +61,26 @@ def skin_forward(
         mean, quat = load_triples(means, first), load_four_columns(quats, first, 0)
         moved, rotated, axes = _times(matrix, mean), _product(rot, quat), rotation_columns(*quat)
         store_columns(
-            deltas,
+            delta_means,
+            first,
+            0,
+            (moved[0] + offset[0] - mean[0], moved[1] + offset[1] - mean[1], moved[2] + offset[2] - mean[2]),
+        )
+        store_columns(
+            delta_scales,
             first,
             0,
             (
-                moved[0] + offset[0] - mean[0],
-                moved[1] + offset[1] - mean[1],
-                moved[2] + offset[2] - mean[2],
                 _log_length(_times(matrix, axes[0])),
                 _log_length(_times(matrix, axes[1])),
                 _log_length(_times(matrix, axes[2])),
-                rotated[0] - quat[0],
-                rotated[1] - quat[1],
-                rotated[2] - quat[2],
-                rotated[3] - quat[3],
             ),
+        )
+        store_columns(
+            delta_quats,
+            first,
+            0,
+            (rotated[0] - quat[0], rotated[1] - quat[1], rotated[2] - quat[2], rotated[3] - quat[3]),
         )
 
 
@@ -86,7 +91,9 @@ def skin_backward(
     weights: np.ndarray,
     ids: np.ndarray,
     motions: np.ndarray,
-    grad_deltas: np.ndarray,
+    grad_delta_means: np.ndarray,
+    grad_delta_scales: np.ndarray,
+    grad_delta_quats: np.ndarray,
     start: int,
     stop: int,
     grad_means: np.ndarray,
@@ -102,7 +109,8 @@ def skin_backward(
         matrix, _, rot, norm = _parts(blended)
         mean, quat = load_triples(means, first), load_four_columns(quats, first, 0)
         axes = rotation_columns(*quat)
-        grad_mean, grad_stretch, grad_quat = _grad_columns(grad_deltas, first)
+        grad_mean, grad_stretch = load_triples(grad_delta_means, first), load_triples(grad_delta_scales, first)
+        grad_quat = load_four_columns(grad_delta_quats, first, 0)
         grad_axes = (
             _grad_log_length(_times(matrix, axes[0]), grad_stretch[0]),
             _grad_log_length(_times(matrix, axes[1]), grad_stretch[1]),
@@ -163,23 +171,23 @@ def _to_nodes(
     dots = np.uint64(MAX_NEAREST * MOTION)
     for lane in range(np.uint64(min(NUM_LANES, stop - first))):
         n, grad = np.uint64(first) + lane, load(grad_rows.reshape(-1), lane * np.uint64(MOTION))
-        for k in range(np.uint64(weights.shape[1])):
+        for k in range(np.uint64(len(weights))):
             row = np.uint64(ids[n, k]) * np.uint64(MOTION)
             store(scratch, k * np.uint64(MOTION), grad * load(motions, row))
-            store(grad_motions, row, fma(spread(weights[n, k]), grad, load(grad_motions, row)))
+            store(grad_motions, row, fma(spread(weights[k, n]), grad, load(grad_motions, row)))
         store(scratch, dots, sums_of(_eight(scratch)))
-        for k in range(np.uint64(weights.shape[1])):
-            grad_weights[n, k] = scratch[dots + k]
+        for k in range(np.uint64(len(weights))):
+            grad_weights[k, n] = scratch[dots + k]
 
 
 @inlined_kernel
 def _blend(weights: np.ndarray, ids: np.ndarray, motions: np.ndarray, first: int, blended: np.ndarray) -> None:
     """Write the weighted sums of the motions of 16 Gaussians, [16, MOTION]; past the last one it is repeated."""
-    flat, last = blended.reshape(-1), np.uint64(len(weights) - 1)
+    flat, last = blended.reshape(-1), np.uint64(len(ids) - 1)
     for lane in range(np.uint64(NUM_LANES)):
         n, total = min(np.uint64(first) + lane, last), spread(weights.dtype.type(0))
-        for k in range(np.uint64(weights.shape[1])):
-            total = fma(spread(weights[n, k]), load(motions, np.uint64(ids[n, k]) * np.uint64(MOTION)), total)
+        for k in range(np.uint64(len(weights))):
+            total = fma(spread(weights[k, n]), load(motions, np.uint64(ids[n, k]) * np.uint64(MOTION)), total)
         store(flat, lane * np.uint64(MOTION), total)
 
 
@@ -191,13 +199,6 @@ def _parts(blended: np.ndarray) -> tuple:
     norm = maximum(norm, filled(MIN_NORM, norm))
     rot = (b[12] / norm, b[13] / norm, b[14] / norm, b[15] / norm)
     return ((b[0], b[1], b[2]), (b[3], b[4], b[5]), (b[6], b[7], b[8])), (b[9], b[10], b[11]), rot, norm
-
-
-@inlined_kernel
-def _grad_columns(grads: np.ndarray, first: int) -> tuple:
-    """The columns of 16 rows of [N, DELTAS]: means 3, logarithms of scales 3, quaternions 4."""
-    a, b, c = load_four_columns(grads, first, 0), load_four_columns(grads, first, 4), load_four_columns(grads, first, 6)
-    return (a[0], a[1], a[2]), (a[3], b[0], b[1]), c
 
 
 @inlined_kernel

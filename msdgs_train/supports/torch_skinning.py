@@ -7,15 +7,15 @@ from msdgs_train.layers.quaternions import multiply, rotation_matrices, unit
 from msdgs_train.supports.skinning_kernels import MIN_STRETCH
 
 
-def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Tensor) -> Tensor:
-    """Deltas [N, 10], differentiable; arguments as of `skinning.skin`."""
+def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Differentiable deltas; arguments and results as of `skinning.skin`."""
     blended = _blend(weights, ids, motions)
     matrices, offsets, rots = blended.split((9, 3, 4), dim=1)
     matrices = matrices.unflatten(1, (3, 3))
     moved = (matrices * means[:, None]).sum(dim=2) + offsets
     squares = (matrices @ rotation_matrices(quats)).square().sum(dim=1)  # of the stretched axes
     stretches = 0.5 * squares.clamp_min(MIN_STRETCH**2).log()
-    return torch.cat([moved - means, stretches, multiply(unit(rots), quats) - quats], dim=1)
+    return moved - means, stretches, multiply(unit(rots), quats) - quats
 
 
 def _blend(weights: Tensor, ids: Tensor, motions: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import mse_loss
 
 from msdgs_train.datasets import Frame, composite
 from msdgs_train.datasets.cache import ImageCache
@@ -106,7 +107,7 @@ class Target(NamedTuple):
 
     def squared_error(self, rgb: Tensor) -> Tensor:
         """Mean squared difference of a rendering, [H, W, 3], over channels and the pixels that count; a scalar."""
-        error = (rgb.detach() - self.rgb).square()
         if self.mask is None:
-            return error.mean()
+            return mse_loss(rgb.detach(), self.rgb)
+        error = (rgb.detach() - self.rgb).square()
         return torch.where(self.mask, error.mean(dim=2), 0.0).sum() / self.mask.sum().clamp(min=1)
