@@ -13,6 +13,7 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import torch
 import tyro
+from rich.console import Console
 
 from benchmarks.measuring import machine, report_console, table
 from msdgs_serve.scene.errors import InvalidInput
@@ -112,6 +113,7 @@ def rows_of_run(run: Path, options: Options) -> Iterator[Row]:
             raise InvalidInput("runs", f"of scenes with {MIN_CAMERAS} training images or more at held-out times", run)
         for t in times:
             moment = at_time(scene, t)
+            Console(stderr=True).print(f"{record.data.name}, {split}: training at t = {t:.3f}", markup=False)
             trainer = trained(static, moment)
             for index, frame in enumerate(evaluation.frames):
                 if is_at(frame, t):
