@@ -17,7 +17,7 @@ from msdgs_serve.rasterizer.jit import inlined_kernel, kernel
 from msdgs_serve.rasterizer.simd.exponential import exp2
 from msdgs_serve.rasterizer.simd.memory import load, prefetch, store
 from msdgs_serve.rasterizer.simd.squares import load_square, load_square_of_triples
-from msdgs_serve.rasterizer.simd.types import NUM_LANES, Vector
+from msdgs_serve.rasterizer.simd.types import NUM_LANES
 from msdgs_serve.rasterizer.simd.vectors import (
     bits_of,
     filled,
@@ -33,7 +33,7 @@ from msdgs_serve.rasterizer.splats import BLUE, DEPTH, EXTENT_X, GREEN, RECORD, 
 from msdgs_serve.rasterizer.tile_blocks import BLOCK_SIDE, BLOCKS, PIXELS, grid_of_a_tile, place_in_tile, touched_blocks
 from msdgs_serve.rasterizer.tiles import TileLists
 from msdgs_serve.rasterizer.view import TILE, RasterizerOptions
-from msdgs_serve.threads import run_parallel, run_serially, run_together, threads_to_use
+from msdgs_serve.threads import run_parallel, run_together, threads_to_use
 
 # offsets in a tile's state: transmittance (0 if the pixel is finished), the pixel's gradient, the contribution of
 # splats behind, and the pixel's position in the tile
@@ -74,18 +74,17 @@ def composite_backward(
         absolute: also the sums of absolute gradients of the mean (AbsGS, Ye et al. 2024), in the columns `ABSOLUTE`.
     """
     records, limits = splats.records, pixel_limits(options, splats.records.dtype)
-    sums, seen = np.zeros((len(records), SUMS), records.dtype), np.empty(len(tiles.offsets) - 1, np.int64)
-    given = (records, tiles, limits, (True,) if absolute else (), (frame.rgb, frame.alpha, grad_rgb, grad_alpha))
-    threads = threads_to_use()
-    if threads == 1:
-        run_serially(_tiles_backward, [(np.array([0, 0]), 0, len(seen), *given, True, sums, seen)])
-        return sums
     rounds = _rounds(tiles.offsets)
     most = max((int(tiles.offsets[past] - tiles.offsets[first]) for first, past in rounds), default=0)
-    pair_sums = np.empty((most, SUMS), records.dtype)
-    slices = list(itertools.pairwise(_depths_between(records, threads)))
+    pair_sums, seen = np.empty((most, SUMS), records.dtype), np.empty(len(tiles.offsets) - 1, np.int64)
+    sums = np.zeros((len(records), SUMS), records.dtype)
+    slices = list(itertools.pairwise(_depths_between(records, threads_to_use())))
+    images = (frame.rgb, frame.alpha, grad_rgb, grad_alpha)
+    absolutes = (True,) if absolute else ()
     for first, past in rounds:
-        run_together(_tiles_backward, (np.array([first, first]), first, past, *given, False, pair_sums, seen))
+        counters = np.array([first, first])
+        arguments = (counters, first, past, records, tiles, limits, absolutes, images, pair_sums, seen)
+        run_together(_tiles_backward, arguments)
         run_parallel(_add_up, [(*depths, first, past, records, tiles, seen, pair_sums, sums) for depths in slices])
     return sums
 
@@ -118,17 +117,15 @@ def _tiles_backward(
     limits: PixelLimits,
     absolutes: tuple,
     images: tuple,
-    adds: bool,
-    sums: np.ndarray,
+    pair_sums: np.ndarray,
     seen: np.ndarray,
 ) -> bool:
     """Write the sums of each pair of splat and tile, for tiles `first_tile` to `past_tile`, and into `seen` how many
     pairs of each tile were processed: those behind finished pixels are skipped. Return whether all these tiles are
     done.
 
-    If one thread `adds` up the sums of each splat at once, in the order of `_add_up`, the gradient takes 0.95 times as
-    long. `absolutes` is (True,) if absolute gradients are summed, or (): its length is known at compile time. `images`
-    are color, alpha, and the gradients of both.
+    `absolutes` is (True,) if absolute gradients are summed, or (): its length is known at compile time. `images` are
+    color, alpha, and the gradients of both.
     """
     state = np.empty(8 * PIXELS, records.dtype)
     record = np.empty(RECORD, records.dtype)
@@ -140,7 +137,7 @@ def _tiles_backward(
     rgb, alpha, grad_rgb, grad_alpha = images
     height, width = alpha.shape
     base = np.uint64(tiles.offsets[first_tile])
-    flat, flat_sums, zero = records.reshape(-1), sums.reshape(-1), spread(records.dtype.type(0))
+    flat, flat_sums = records.reshape(-1), pair_sums.reshape(-1)
     pixels = (rgb.reshape(-1), alpha.reshape(-1), grad_rgb.reshape(-1), grad_alpha.reshape(-1))
     while True:
         first = fetch_add(counters, TAKEN, TILES_PER_TURN)
@@ -159,17 +156,12 @@ def _tiles_backward(
             first_pair, past = np.uint64(tiles.offsets[tile]), np.uint64(tiles.offsets[tile + 1])
             pair = first_pair
             while pair < past and alive != np.uint64(0):
-                upcoming = np.uint64(tiles.splat_ids[min(pair + PREFETCH_DISTANCE, past - np.uint64(1))])
-                splat = np.uint64(tiles.splat_ids[pair])
-                prefetch(flat, upcoming * np.uint64(RECORD))
-                place, before = (pair - base) * np.uint64(SUMS), zero
-                if adds:
-                    prefetch(flat_sums, upcoming * np.uint64(SUMS))
-                    place = splat * np.uint64(SUMS)
-                    before = load(flat_sums, place)
-                store(record, 0, load(flat, splat * np.uint64(RECORD)) - load(origin, 0))
+                upcoming = min(pair + PREFETCH_DISTANCE, past - np.uint64(1))
+                prefetch(flat, np.uint64(tiles.splat_ids[upcoming]) * np.uint64(RECORD))
+                store(record, 0, load(flat, np.uint64(tiles.splat_ids[pair]) * np.uint64(RECORD)) - load(origin, 0))
                 bits = alive & bits_of(touched_blocks(record, grid, limits.log2_alpha_min))
-                alive &= ~_splat_backward(bits, record, limits, absolutes, state, before, flat_sums, place)
+                place = (pair - base) * np.uint64(SUMS)
+                alive &= ~_splat_backward(bits, record, limits, absolutes, state, flat_sums, place)
                 pair += np.uint64(1)
             seen[tile] = pair - first_pair
         fetch_add(counters, DONE, end_of_turn - first)
@@ -235,12 +227,10 @@ def _splat_backward(
     limits: PixelLimits,
     absolutes: tuple,
     state: np.ndarray,
-    before: Vector,
     sums: np.ndarray,
     place: np.uint64,
 ) -> np.uint64:
-    """Write the sums of a splat over the blocks whose `bits` are set, plus those `before`. Return the mask of blocks
-    that it finishes."""
+    """Write the sums of a splat over the blocks whose `bits` are set. Return the mask of blocks that it finishes."""
     zero = spread(record.dtype.type(0))
     sum_red, sum_green, sum_blue = zero, zero, zero
     sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy = zero, zero, zero, zero, zero, zero
@@ -287,9 +277,9 @@ def _splat_backward(
     moments = (sum_red, sum_green, sum_blue, sum_1, sum_x, sum_y, sum_xx, sum_xy, sum_yy)
     if len(absolutes) > 0:
         per_root = spread(record.dtype.type(1 / ROOT_SCALE**2))
-        store(sums, place, before + sums_of((*moments, sum_abs_x * per_root, sum_abs_y * per_root)))
+        store(sums, place, sums_of((*moments, sum_abs_x * per_root, sum_abs_y * per_root)))
     else:
-        store(sums, place, before + sums_of(moments))
+        store(sums, place, sums_of(moments))
     return done
 
 

@@ -285,7 +285,6 @@ def test_same_bytes_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize("pairs", [1, 50])
 def test_in_rounds_the_gradient_is_the_same(monkeypatch: pytest.MonkeyPatch, pairs: int):
     """As in large images, whose sums of all pairs would take too much memory."""
-    monkeypatch.setenv("MSDGS_THREADS", "2")  # one thread has no sums of pairs
     gaussians, camera = random_scene(58, 200, 90, 70)
     loss, parameters = weighted(np.ones((70, 90))), parameters_of(gaussians, torch.float32)
     at_once = gradients(draw(parameters, camera), loss, parameters)
