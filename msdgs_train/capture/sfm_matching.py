@@ -81,7 +81,8 @@ def geometry_options(job: PosesJob, database: Path) -> pycolmap.TwoViewGeometryO
 
 def tolerance_of(database: Path) -> float:
     with pycolmap.Database.open(database) as opened:
-        return max(MIN_TOLERANCE, TOLERANCE * max(max(camera.width, camera.height) for camera in opened.read_all_cameras()))
+        sides = [max(camera.width, camera.height) for camera in opened.read_all_cameras()]
+    return max(MIN_TOLERANCE, TOLERANCE * max(sides))
 
 
 def only_fixed(job: PosesJob) -> bool:
