@@ -59,8 +59,8 @@ def parse(field: str, text: Any) -> dict[str, Any]:
             raise ValueError("a value without a name")
         for keyword in call.keywords:
             assert keyword.arg is not None
-            word = isinstance(keyword.value, ast.Name)
-            settings[keyword.arg] = keyword.value.id if word else ast.literal_eval(keyword.value)
+            value = keyword.value
+            settings[keyword.arg] = value.id if isinstance(value, ast.Name) else ast.literal_eval(value)
     except (SyntaxError, ValueError, AssertionError) as error:
         raise InvalidInput(field, "a kind with its settings, as in mlp:width=96,depth=2", text) from error
     return settings
