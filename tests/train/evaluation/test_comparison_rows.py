@@ -89,7 +89,7 @@ def test_scenes_of_other_names_and_missing_folders_are_refused(data: Path) -> No
         read_scenes([data / "none"])
 
 
-@pytest.mark.parametrize(("name", "count"), [("scenes", 8), ("more_scenes", 5), ("k_steps", 4), ("captures", 5)])
+@pytest.mark.parametrize(("name", "count"), [("scenes", 9), ("more_scenes", 5), ("k_steps", 4), ("captures", 5)])
 def test_scenes_of_the_benchmarks_can_be_read(name: str, count: int, tmp_path: Path) -> None:
     file = tmp_path / "benchmarks" / "training" / "scenes.toml"
     file.parent.mkdir(parents=True)
