@@ -20,10 +20,13 @@ MAX_FEATURES, BACKGROUND_FEATURES = 2000, 8192
 0.02 % of their extent instead of 0.04 % (median), in twice the time."""
 BATCH = 16
 """Images, or hundreds of pairs, between two reports of progress."""
-TOLERANCE, MIN_TOLERANCE = 1 / 700, 0.5
+TOLERANCE, MIN_TOLERANCE = 1 / 700, 1.0
 """Pixels of error that a match and a point may have: per pixel of the long side, and at least. COLMAP's are four
-pixels, which in a small image is the motion of an object between two frames: with one pixel, 300 frames of 320 pixels
-before a large moving poster are off by up to 2.8°, with half a pixel by 0.13°."""
+pixels, which in a small image is the motion of an object between two frames."""
+MANY, MIN_TOLERANCE_OF_MANY = 50, 0.5
+"""Images that are so many that motion between neighbors is small, and their least tolerance: with one pixel, 300 frames
+of 320 pixels before a large moving poster are off by up to 2.8°, with half a pixel by 0.13°. Few images have too few
+matches for it."""
 
 
 def extract(job: PosesJob, database: Path) -> None:
@@ -82,7 +85,8 @@ def geometry_options(job: PosesJob, database: Path) -> pycolmap.TwoViewGeometryO
 def tolerance_of(database: Path) -> float:
     with pycolmap.Database.open(database) as opened:
         sides = [max(camera.width, camera.height) for camera in opened.read_all_cameras()]
-    return max(MIN_TOLERANCE, TOLERANCE * max(sides))
+        least = MIN_TOLERANCE if opened.num_images() < MANY else MIN_TOLERANCE_OF_MANY
+    return max(least, TOLERANCE * max(sides))
 
 
 def only_fixed(job: PosesJob) -> bool:

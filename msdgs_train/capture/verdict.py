@@ -18,7 +18,7 @@ MIN_REGISTERED, FEW_REGISTERED = 0.5, 0.95
 """Shares of frames with poses."""
 MIN_WHOLE = 0.75
 """The same, where poses break off."""
-MIN_BEYOND_ROTATION, LEAST_PIXELS = 1 / 1000, 0.5
+MIN_BEYOND_ROTATION, LEAST_PIXELS = 1 / 1000, 0.65
 """In longer sides of the frames, and in pixels at least, as matches are no better."""
 MIN_AGREEMENT = 0.4
 """Of the features of moving cameras that are found again, as observations of points: 0.7 and more with right poses, and
