@@ -26,7 +26,7 @@ from msdgs_train.engine.run_record import read_config, read_record
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.evaluation.evaluate import EvaluatedModel, evaluate_run
 from msdgs_train.evaluation.metrics import masked_psnr, psnr
-from msdgs_train.systems.registry import preset
+from msdgs_train.systems.registry import DEFAULT, preset
 
 SPLITS = ("val", "test")
 STEPS = 3000
@@ -41,9 +41,9 @@ class Options:
     on held-out images of the same times. Where the static model is ahead, quality is lost to motion; where it is
     behind, other times add what its cameras don't see.
 
-    python -m benchmarks.training.static_oracle runs/bench/msdgs-nodes/toybench_dome_200/seed0
+    python -m benchmarks.training.static_oracle runs/bench/msdgs-nodes/toybench_dome_200_0
 
-    The static model is the preset `static` of 3,000 steps, at the size and seed of the run.
+    The static model is the default system without layers, trained for 3,000 steps at the size and seed of the run.
     """
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
@@ -84,6 +84,10 @@ def main(options: Options) -> int:
     if options.check:
         return self_test(options)
     try:
+        if not options.runs:
+            raise InvalidInput("runs", "folders of finished runs", "none")
+        if options.times < 1:
+            raise InvalidInput("times", "1 or more", options.times)
         rows = [row for run in options.runs for row in rows_of_run(run, options)]
     except InvalidInput as error:
         report_console().print(f"error: {error}", style="red", markup=False)
@@ -100,9 +104,7 @@ def rows_of_run(run: Path, options: Options) -> Iterator[Row]:
     if record is None:
         raise InvalidInput("runs", "folders of finished runs", run)
     c = config.data
-    static = preset("static").updated(
-        **asdict(c), steps=options.steps, threads=options.threads, seed=config.run.seed, eval_every=0
-    )
+    static = oracle().updated(**asdict(c), steps=options.steps, threads=options.threads, seed=config.run.seed)
     scene = load_scene(record.data, c.size, c.llffhold, c.time_from, c.masks)
     for split in (split for split in SPLITS if scene.splits[split]):
         evaluation = evaluate_run(run, record.data, split, brief=True)
@@ -129,6 +131,12 @@ def rows_of_run(run: Path, options: Options) -> Iterator[Row]:
                         static=drawn,
                         dynamic=Scores(found.psnr, found.moving_psnr),
                     )
+
+
+def oracle() -> TrainConfig:
+    """The default system without motion. Its loss, start and density control matter with few views, for which the
+    preset `static` isn't made."""
+    return preset(DEFAULT).updated(support="gaussians", layers=(), static_fraction=0.0, window_full_fraction=0.0)
 
 
 def spread_times(scene: SceneData, frames: Sequence[Frame], count: int) -> list[float]:
@@ -181,15 +189,17 @@ def cells(rows: Sequence[Row]) -> list[str]:
     """The numbers of a line."""
     cameras = sorted({row.cameras for row in rows})
     found = [str(len(rows)), "–".join(map(str, dict.fromkeys((cameras[0], cameras[-1]))))]
-    for pairs in (
-        [(row.static.psnr, row.dynamic.psnr) for row in rows],
-        [(row.static.moving, row.dynamic.moving) for row in rows if row.static.moving and row.dynamic.moving],
-    ):
-        if not pairs:
-            return [*found, "–", "–", "–"]
-        static, dynamic = (fmean(each) for each in zip(*pairs, strict=True))
-        found += [f"{static:.2f}", f"{dynamic:.2f}", f"{dynamic - static:+.2f}"]
-    return found
+    found += compared([(row.static.psnr, row.dynamic.psnr) for row in rows])
+    return found + compared([(row.static.moving, row.dynamic.moving) for row in rows])
+
+
+def compared(pairs: Sequence[tuple[float | None, float | None]]) -> list[str]:
+    """The means of both, and the gain of the second, over the pairs that are known."""
+    known = [(static, dynamic) for static, dynamic in pairs if static is not None and dynamic is not None]
+    if not known:
+        return ["–"] * 3
+    static, dynamic = (fmean(each) for each in zip(*known, strict=True))
+    return [f"{static:.2f}", f"{dynamic:.2f}", f"{dynamic - static:+.2f}"]
 
 
 def write(rows: Sequence[Row], file: Path) -> None:
