@@ -16,7 +16,7 @@ import tyro
 from rich.console import Console
 
 from benchmarks.measuring import machine, report_console, table
-from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.writing import write_text
 from msdgs_train.datasets import Frame, SceneData, load_scene
 from msdgs_train.datasets.synthetic.generate import generate
@@ -89,7 +89,7 @@ def main(options: Options) -> int:
         if options.times < 1:
             raise InvalidInput("times", "1 or more", options.times)
         rows = [row for run in options.runs for row in rows_of_run(run, options)]
-    except InvalidInput as error:
+    except MsdgsError as error:
         report_console().print(f"error: {error}", style="red", markup=False)
         return 1
     show(rows)
