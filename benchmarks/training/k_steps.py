@@ -24,6 +24,7 @@ from msdgs_train.comparison.rows import Row, rows_of, runs_left, train_and_measu
 from msdgs_train.comparison.scenes import read_scenes
 from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
 from msdgs_train.layers.base import PAPER_HEADS
+from msdgs_train.layers.bodies import BodiesConfig
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.systems.registry import DEFAULT, preset
 
@@ -33,9 +34,16 @@ SCENES_FILE = Path(__file__).with_name("k_steps.toml")
 SCENES = ("toybench_100", "toybench_slow_100", "lego_100")
 CHAIN, WIDE = "K layers", "1 layer of as many parameters"
 UNWEIGHTED, MODULATED = "K layers, w = 1", "K layers, modulated"
-FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED)
-GAINS = {f"of {CHAIN} over {WIDE}": (CHAIN, WIDE), "of w": (CHAIN, UNWEIGHTED), "of modulation": (MODULATED, CHAIN)}
-OVER_ONE = f"of {CHAIN} over one of them"
+COARSE, COARSE_WIDE = "bodies and K - 1 layers", "bodies and 1 layer of as many parameters"
+FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED, COARSE, COARSE_WIDE)
+TIMED = (CHAIN, COARSE)
+"""Those of equal time."""
+GAINS = {
+    f"of {CHAIN} over {WIDE}": (CHAIN, WIDE),
+    "of w": (CHAIN, UNWEIGHTED),
+    "of modulation": (MODULATED, CHAIN),
+    f"of {COARSE} over {COARSE_WIDE}": (COARSE, COARSE_WIDE),
+}
 
 
 def main(
@@ -49,13 +57,13 @@ def main(
     check: bool = False,
 ) -> int:
     """Train K = 1, 2, 4 and 10 layers, and one layer of as many parameters as each, with and without step weights and
-    modulation; print a table and draw PSNR on test images against K.
+    modulation, and with rigid bodies as the first layer; print a table and draw PSNR on test images against K.
 
     python -m benchmarks.training.k_steps --csv docs/data/k_steps.csv
 
     Each run has one thread. The bits of a run of a number of steps don't depend on what else the machine does. With
-    `--minutes` the runs are of equal time, and only the K layers themselves are trained: whether more of them pay
-    although each step takes longer. Runs that have a row in the file are not trained again.
+    `--minutes` the runs are of equal time, and only the K layers themselves are trained, with and without bodies:
+    whether more of them pay although each step takes longer. Runs that have a row in the file are not trained again.
 
     Args:
         out: The folder of runs, table and figure.
@@ -75,7 +83,7 @@ def main(
         if steps is None and minutes is None:
             steps = STEPS
         budget = Budget(steps, minutes, time="cpu")
-        families = FAMILIES if minutes is None else (CHAIN,)
+        families = FAMILIES if minutes is None else TIMED
         configs = {name: budget.of(config).updated(eval_every=0) for name, config in systems(families).items()}
         runs = make_runs(configs, found, seeds, out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
@@ -97,6 +105,8 @@ def systems(families: Sequence[str] = FAMILIES) -> dict[str, TrainConfig]:
         WIDE: {k: base.updated(layers=(wide_layer(k),)) for k in NUM_LAYERS[1:]},
         UNWEIGHTED: {k: config.updated(weights=False) for k, config in chains.items()},
         MODULATED: {k: config.updated(embedding_dim=32) for k, config in chains.items()},
+        COARSE: {k: base.updated(layers=(BodiesConfig(), *(SMALL_LAYER,) * (k - 1))) for k in NUM_LAYERS},
+        COARSE_WIDE: {k: base.updated(layers=(BodiesConfig(), wide_layer(k - 1))) for k in NUM_LAYERS if k > 2},
     }
     return {name_of(family, k): config for family in families for k, config in made[family].items()}
 
@@ -122,13 +132,13 @@ def report(rows: Sequence[Row], scenes: Sequence[str], figure_file: Path, consol
     """Print a table of PSNR, also of the moving region where it is known from the images, and one of gains; draw the
     figure."""
     absolute = table("PSNR on test images, dB", "scene", "K", *FAMILIES, f"moving region, {CHAIN}")
-    gains = table("Gains, dB (95 % over images)", "scene", "K", *GAINS, OVER_ONE)
+    gains = table("Gains, dB (95 % over images)", "scene", "K", *GAINS, *(f"of {name} over K = 1" for name in TIMED))
     for scene, k in itertools.product(scenes, NUM_LAYERS):
         values = [psnrs(rows, scene, name_of(family, k)) for family in FAMILIES]
         values.append(psnrs(rows, scene, name_of(CHAIN, k), "test_moving_psnr"))
         absolute.add_row(scene, str(k), *(mean_and_deviation(found, 2) if found else "–" for found in values))
         pairs = [(name_of(one, k), name_of(other, k)) for one, other in GAINS.values()]
-        pairs.append((name_of(CHAIN, k), name_of(CHAIN, NUM_LAYERS[0])))
+        pairs += [(name_of(family, k), name_of(family, NUM_LAYERS[0])) for family in TIMED]
         gains.add_row(scene, str(k), *(gain(rows, [scene], *pair) for pair in pairs))
     console.print(absolute, gains)
     console.print(f"machine: {machines_of(rows)}")
@@ -154,7 +164,7 @@ def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
         axes.minorticks_off()
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("PSNR on test images, dB")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize="small")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
     return figure
 
 
@@ -165,7 +175,7 @@ def psnrs(rows: Sequence[Row], scene: str, system: str, column: str = "test_psnr
 
 def self_test() -> int:
     """Equal parameters within 2 %, and a figure and a table of two scenes that lack some runs."""
-    for k in NUM_LAYERS[1:]:
+    for k in (*NUM_LAYERS[1:], *(k - 1 for k in NUM_LAYERS if k > 2)):
         ratio = parameters(wide_layer(k)) / (k * parameters(SMALL_LAYER))
         assert abs(ratio - 1) < 0.02, (k, ratio)
     rows = [
@@ -188,7 +198,7 @@ def self_test() -> int:
     text = console.export_text()
     assert "+3.00 (+3.00 to +3.00)" in text
     assert text.count("20.00") == 1
-    assert list(systems((CHAIN,))) == [name_of(CHAIN, k) for k in NUM_LAYERS]
+    assert list(systems(TIMED)) == [name_of(family, k) for family in TIMED for k in NUM_LAYERS]
     print("ok: equal parameters, a table and a figure")
     return 0
 
