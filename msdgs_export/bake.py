@@ -152,5 +152,6 @@ def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
 
 def changing_outputs(model: DynamicGaussians) -> tuple[str, ...]:
     """Those of opacities and SH that depend on time."""
-    heads = {"opacities": model.config.opacity_head, "sh": model.config.sh_head}
+    shades = any(layer.shades for layer in model.deformation)
+    heads = {"opacities": model.config.opacity_head, "sh": model.config.sh_head or shades}
     return tuple(name for name, is_on in heads.items() if is_on and len(model.deformation))

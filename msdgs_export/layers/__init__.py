@@ -3,7 +3,7 @@
 A kind from outside this package registers itself with `LAYERS[kind] = export`, a `LayerExport`.
 """
 
-from msdgs_export.layers.base import HEAD_COLUMNS, HEADS, LayerExport, LayerInputs, ModelNotExportable
+from msdgs_export.layers.base import GAINS, HEAD_COLUMNS, HEADS, LayerExport, LayerInputs, ModelNotExportable
 from msdgs_export.layers.bodies import BodiesExport
 from msdgs_export.layers.hash4d import Hash4DExport
 from msdgs_export.layers.mlp import MLPExport
@@ -11,7 +11,7 @@ from msdgs_export.layers.plane import PlaneExport
 from msdgs_export.layers.spline import SplineExport
 from msdgs_train.layers.base import DeformationLayer
 
-__all__ = ["HEADS", "HEAD_COLUMNS", "LAYERS", "LayerExport", "LayerInputs", "ModelNotExportable", "export_of"]
+__all__ = ["GAINS", "HEADS", "HEAD_COLUMNS", "LAYERS", "LayerExport", "LayerInputs", "ModelNotExportable", "export_of"]
 
 LAYERS: dict[str, LayerExport] = {
     "mlp": MLPExport(),

@@ -14,6 +14,9 @@ from msdgs_train.layers.base import HEAD_COLUMNS, PAPER_HEADS, DeformationLayer,
 HEADS = tuple(HEAD_COLUMNS)
 """The heads of poses. Others, of opacities and SH, are named as the outputs of a scene file."""
 
+GAINS = "gains"
+"""The head of gains of colors, of layers that shade."""
+
 
 class ModelNotExportable(MsdgsError):
     """A model has values or parts that a scene file can't hold."""
@@ -47,6 +50,10 @@ class LayerExport(Protocol):
         first layer of a chain, whose points are canonical, may have any."""
         ...
 
+    def gains(self, graph: GraphBuilder, inputs: LayerInputs) -> str | None:
+        """Add the nodes of the layer's gains of colors, [P, 3], times the gate; None if it has none."""
+        ...
+
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """The heads whose deltas are always 0."""
         ...
@@ -71,6 +78,10 @@ class FieldLayerExport:
     def point_constants(self, layer: DeformationLayer, points: np.ndarray) -> dict[str, np.ndarray]:
         """None: the field is evaluated in the graph."""
         return {}
+
+    def gains(self, graph: GraphBuilder, inputs: LayerInputs) -> str | None:
+        """None: colors change by the head of SH."""
+        return None
 
     def outputs(self, graph: GraphBuilder, inputs: LayerInputs, rows: np.ndarray) -> str:
         """Add the nodes of the field. Returns these output columns, [P, len(rows)]; the logit of the weight is last, if

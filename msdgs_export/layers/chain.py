@@ -49,15 +49,16 @@ def summed_deltas(
     num_nodes: int | None = None,
     constants: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, str]:
-    """Deltas of points, [P, 3], by head; on control nodes scales have six columns. `constants` are the graph's values
-    of `point_constants`."""
+    """Deltas of points, [P, 3], by head, and `gains` if layers have any; on control nodes scales have six columns.
+    `constants` are the graph's values of `point_constants`."""
     widths = {name: columns.stop - columns.start for name, columns in heads_of(layers[0]).columns.items()}
     widths |= {} if num_nodes is None else {"scales": STRETCH_COLUMNS}
-    total, moved, parts = "", points, dict[str, str]()
+    total, gains, moved, parts = "", "", points, dict[str, str]()
     for k, layer in enumerate(layers, start=1):
         name, export = f"layer{k}", export_of(layer)
         own = {n.removeprefix(f"{name}."): value for n, value in constants.items() if n.startswith(f"{name}.")}
-        step = export.deltas(graph, LayerInputs(name, layer, moved, time, _gate(graph, name, steps, k), own), used)
+        inputs = LayerInputs(name, layer, moved, time, _gate(graph, name, steps, k), own)
+        step = export.deltas(graph, inputs, used)
         if num_nodes is not None and export.scale_columns != STRETCH_COLUMNS:
             step = _padded(graph, name, step, num_nodes)
         total = graph.node("Add", [total, step], f"{name}.deltas") if total else step
@@ -65,7 +66,9 @@ def summed_deltas(
         parts = dict(zip(used, graph.split(total, [f"{name}.{head}" for head in used], sizes), strict=True))
         if k < len(layers) and "means" in parts:
             moved = graph.node("Add", [points, parts["means"]], f"{name}.moved")
-    return parts
+        if more := export.gains(graph, inputs):
+            gains = graph.node("Add", [gains, more], f"{name}.all_gains") if gains else more
+    return parts | ({"gains": gains} if gains else {})
 
 
 def _padded(graph: GraphBuilder, name: str, step: str, num_nodes: int) -> str:

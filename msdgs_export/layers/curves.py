@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from onnx import TensorProto
 
+from msdgs_export.layers.base import LayerInputs
 from msdgs_export.layers.graph import GraphBuilder, to_numpy
 from msdgs_train.layers.base import DeformationLayer
 from msdgs_train.layers.curves import CurveLayer
@@ -23,12 +24,16 @@ class CurveLayerExport:
         """None: curves and weights belong to nodes, wherever they are."""
         return {}
 
+    def gains(self, graph: GraphBuilder, inputs: LayerInputs) -> str | None:
+        """None: curves are poses."""
+        return None
+
     def inert_heads(self, layer: DeformationLayer) -> frozenset[str]:
         """No heads, since curves translate and rotate."""
         return frozenset()
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
-        """The layer as it is: it has no heads to remove."""
+        """The layer as it is: it has no such heads."""
         return layer
 
 

@@ -16,6 +16,7 @@ from msdgs_export.plans.scene_graph import changing_output, finished, new_graph,
 from msdgs_export.supports import Layout, SupportInputs, support_export_of
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT, MIN_SCALE
 
 
@@ -42,6 +43,7 @@ def _deform(graph: GraphBuilder, baked: Baked, layout: Layout | None) -> None:
     constants = {name: rows.of(name, values) for name, values in constants}
     inputs = SupportInputs(baked.support, baked.layers, means, quats, time, steps, attributes, constants)
     plain = not moving.modulation and baked.scene.metadata.delta_space == "raw"
+    parts: dict[str, str] = {}
     poses = export.poses(graph, inputs, log_scales) if plain else None
     if poses is None:
         parts = export.deltas(graph, inputs)
@@ -56,13 +58,17 @@ def _deform(graph: GraphBuilder, baked: Baked, layout: Layout | None) -> None:
         if is_raw:
             raw_quats = ellipsoids(graph, raw_quats, scales, poses["scales"])
         unit_quats(graph, raw_quats, poses["quats"])
-        for name, values in moving.appearance.items():
-            deltas = parts.get(name)
-            if deltas and name == "sh" and heads_of(baked.layers[0]).sh > values.shape[1]:  # bands were pruned
-                columns = graph.constant("sh.columns", np.arange(values[0].size))
-                deltas = graph.node("Gather", [deltas, columns], "sh.deltas", axis=1)
-            changing_output(graph, baked.scene, name, _appearance(graph, rows, name, values, deltas))
-    rows.put_in_order(poses)
+    gains = poses.pop("gains", None) or parts.get("gains")
+    shown: dict[str, str] = {}
+    for name, values in moving.appearance.items():
+        deltas = parts.get(name)
+        if deltas and name == "sh" and heads_of(baked.layers[0]).sh > values.shape[1]:  # bands were pruned
+            columns = graph.constant("sh.columns", np.arange(values[0].size))
+            deltas = graph.node("Gather", [deltas, columns], "sh.deltas", axis=1)
+        shown[f"{name}.shown"] = _appearance(graph, rows, name, values, deltas, gains)
+    ordered = rows.in_order(poses | shown)
+    for name in moving.appearance:
+        changing_output(graph, baked.scene, name, ordered[f"{name}.shown"])
 
 
 class _Rows:
@@ -81,20 +87,22 @@ class _Rows:
         """The name of an output in the order of the rows."""
         return name if self.layout is None else f"rows.{name}"
 
-    def put_in_order(self, poses: Mapping[str, str]) -> None:
-        """Add the nodes that take each Gaussian once, in order, from the poses of a layout's rows."""
+    def in_order(self, values: Mapping[str, str]) -> dict[str, str]:
+        """Add the nodes that take each Gaussian once, in order, from values of a layout's rows; the results, by the
+        same names, have these names."""
         if self.layout is None:
-            return
+            return dict(values)
         graph, row_of_id = self._graph, np.zeros(self._count, np.int32)
         row_of_id[self.layout.rows[::-1]] = np.arange(len(self.layout.rows))[::-1]
         padding = len(self.layout.rows) - self._count
         if np.array_equal(row_of_id, np.arange(self._count)):
-            for name, value in poses.items():
+            for name, value in values.items():
                 graph.split(value, [name, f"{name}.padding"], [self._count, padding], axis=0)
         else:
             ids = graph.node("Cast", [graph.constant("row_of_id", row_of_id)], "rows.of_id", to=TensorProto.INT64)
-            for name, value in poses.items():
+            for name, value in values.items():
                 graph.node("Gather", [value, ids], name)
+        return {name: name for name in values}
 
 
 def _modulated(graph: GraphBuilder, rows: _Rows, part: str, factors: np.ndarray | None, deltas: str) -> str:
@@ -105,12 +113,26 @@ def _modulated(graph: GraphBuilder, rows: _Rows, part: str, factors: np.ndarray 
     return graph.node("Mul", [rows.of(name, factors), deltas], f"{name}.applied")
 
 
-def _appearance(graph: GraphBuilder, rows: _Rows, name: str, values: np.ndarray, deltas: str | None) -> str:
-    """Opacities, [M, 1], or SH, [M, 3 C], plus their deltas."""
+def _appearance(
+    graph: GraphBuilder, rows: _Rows, name: str, values: np.ndarray, deltas: str | None, gains: str | None
+) -> str:
+    """Opacities, [R, 1], or SH, [R, 3 C], plus their deltas; colors of SH times 1 + gains, [R, 3]."""
     canonical = rows.of(f"canonical_{name}", values.reshape(len(values), -1))
+    if name == "sh" and gains is not None:
+        canonical = _shaded(graph, canonical, gains, values.shape[1])
     if deltas is not None:
         canonical = graph.node("Add", [canonical, deltas], f"{name}.moved")
     return graph.node("Sigmoid", [canonical], f"{name}.activated") if name == "opacities" else canonical
+
+
+def _shaded(graph: GraphBuilder, sh: str, gains: str, coefficients: int) -> str:
+    """[R, 3 C] SH of colors times 1 + gains: a color is 0.5 plus the sum of its bands."""
+    every = graph.constant("shading.bands", np.tile(np.eye(3, dtype=np.float32), coefficients))
+    half = np.zeros(3 * coefficients, np.float32)
+    half[:3] = 0.5 / SH_C0
+    colors = graph.node("Add", [sh, graph.constant("shading.half", half)], "shading.colors")
+    added = graph.node("Mul", [graph.node("MatMul", [gains, every], "shading.gains"), colors], "shading.added")
+    return graph.node("Add", [sh, added], "shading.sh")
 
 
 def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_space: str, output: str) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from msdgs_export.bake import Baked, bake, limits_left_out
-from msdgs_export.layers import export_of
+from msdgs_export.layers import GAINS, export_of
 from msdgs_export.measure.poses import posed
 from msdgs_export.spatial_order import morton_order
 from msdgs_export.supports import support_export_of
@@ -164,12 +164,13 @@ def _model(
 
 
 def _removable_heads(model: DynamicGaussians) -> frozenset[str]:
-    """Heads that pruning may remove: none on control nodes, where a Gaussian's pose depends on all of them."""
-    if not support_export_of(model.support).heads_are_removable:
-        return frozenset()
-    return frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation))
+    """Heads that pruning may remove: on control nodes only gains, since a Gaussian's pose depends on all others."""
+    known = frozenset[str]().union(*(export_of(layer).removable_heads for layer in model.deformation))
+    known = known if any(layer.shades for layer in model.deformation) else known - {GAINS}
+    return known if support_export_of(model.support).heads_are_removable else known & {GAINS}
 
 
 def _without_heads(layer: DeformationLayer, removed: frozenset[str]) -> DeformationLayer:
     """The layer with zeros in place of the heads that are removed; a plan stores no column that is all zeros."""
-    return export_of(layer).without_heads(layer, removed) if removed else layer
+    own = removed & export_of(layer).removable_heads
+    return export_of(layer).without_heads(layer, own) if own else layer

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msdgs_export.layers import HEADS
+from msdgs_export.layers import GAINS, HEADS
 from msdgs_export.pruning.mask import PruningMask
 from msdgs_export.pruning.statistics import PruningStatistics
 
@@ -41,8 +41,8 @@ def modulation(statistics: PruningStatistics, mask: PruningMask, min_db: float) 
 
 
 def heads(statistics: PruningStatistics, mask: PruningMask, min_db: float) -> PruningMask:
-    """Remove heads of all layers, for positions, scales or rotations, that change nothing."""
-    for name in sorted(mask.network.heads, key=HEADS.index, reverse=True):
+    """Remove heads of all layers, for positions, scales, rotations or shading, that change nothing."""
+    for name in sorted(mask.network.heads, key=(*HEADS, GAINS).index, reverse=True):
         mask = _if_allowed(statistics, mask, min_db, heads=mask.network.heads - {name})
     return mask
 

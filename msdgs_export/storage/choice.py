@@ -51,6 +51,9 @@ GROUPS = {
         | {"rank 64": low_rank(64, fine=24)}
         | _bits(in_range, 16),
     ),
+    "shading": Group(
+        r"layer\d+\.gains\.table", {f"rank {rank}": low_rank(rank) for rank in (8, 16, 32)} | _bits(in_range, 8, 16)
+    ),
     "planes": Group(r"layer\d+\.grid\d+\.(space|time)", _bits(in_range, 8, 16)),
     "hash grids": Group(r"layer\d+\.now\.table", _bits(in_range, 8, 16)),
     "features of points": Group(r"layer\d+\.canonical", _bits(in_range, 8, 16)),

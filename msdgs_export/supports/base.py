@@ -53,10 +53,10 @@ class SupportExport:
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         """Add the nodes of the chain and of the support. Returns the summed deltas of the rows by head, without heads
-        that are always 0 (equations 7 to 9, before modulation)."""
+        that are always 0 (equations 7 to 9, before modulation), and `gains`, [R, 3], if colors change."""
         raise NotImplementedError
 
     def poses(self, graph: GraphBuilder, inputs: SupportInputs, log_scales: str) -> dict[str, str] | None:
         """Add the nodes of means, scales and quaternions of a layout's rows, deformed without modulation and with
-        deltas of logarithms of scales, [R, 3]; None to have them computed from `deltas`."""
+        deltas of logarithms of scales, [R, 3], and of `gains`; None to have them computed from `deltas`."""
         return None

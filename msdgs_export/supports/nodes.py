@@ -15,7 +15,7 @@ from msdgs_export.layers.graph import GraphBuilder, to_numpy
 from msdgs_export.layers.rotations import IDENTITY, rotation_columns, turned, unit_rows
 from msdgs_export.supports.base import Layout, SupportExport, SupportInputs
 from msdgs_export.supports.blocks import block_layout
-from msdgs_export.supports.skinning import Blend, columns_of, reshaped, skinned_deltas, skinned_poses
+from msdgs_export.supports.skinning import Blend, columns_of, reshaped, rows_of, skinned_deltas, skinned_poses
 from msdgs_train.supports.base import Support
 from msdgs_train.supports.nodes import NodesSupport
 
@@ -35,15 +35,17 @@ class NodesExport(SupportExport):
 
     def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
         """Motions of the nodes, blended for each Gaussian, minus its canonical pose."""
-        return skinned_deltas(graph, _blend(graph, inputs))
+        blend, gains = _blend(graph, inputs)
+        return skinned_deltas(graph, blend) | gains
 
     def poses(self, graph: GraphBuilder, inputs: SupportInputs, log_scales: str) -> dict[str, str]:
         """Motions of the nodes, blended for each Gaussian, applied to its canonical pose."""
-        return skinned_poses(graph, _blend(graph, inputs), log_scales)
+        blend, gains = _blend(graph, inputs)
+        return skinned_poses(graph, blend, log_scales) | gains
 
 
-def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
-    """[M, 16] `NodesSupport.motions`, but matrices column by column."""
+def _motions(graph: GraphBuilder, inputs: SupportInputs) -> tuple[str, dict[str, int]]:
+    """`NodesSupport.motions`, [M, ·], but matrices column by column; and its parts' numbers of columns."""
     support = cast(NodesSupport, inputs.support)
     positions = to_numpy(support.nodes)
     nodes = graph.constant("nodes", positions)
@@ -54,7 +56,10 @@ def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     rots = unit_rows(graph, "nodes.rots", raw)
     matrices = _stretching(graph, "nodes.matrices", rotation_columns(graph, "nodes.rotations", rots), parts["scales"])
     offsets = node_offsets(graph, nodes, parts["means"], matrices)
-    return graph.node("Concat", [matrices, offsets, rots], "nodes.motions", axis=1)
+    columns = {"matrices": (matrices, 9), "offsets": (offsets, 3), "rots": (rots, 4)}
+    columns |= {"gains": (parts["gains"], 3)} if "gains" in parts else {}
+    motions = graph.node("Concat", [value for value, _ in columns.values()], "nodes.motions", axis=1)
+    return motions, {name: width for name, (_, width) in columns.items()}
 
 
 def node_offsets(graph: GraphBuilder, nodes: str, translations: str, matrices: str) -> str:
@@ -63,14 +68,14 @@ def node_offsets(graph: GraphBuilder, nodes: str, translations: str, matrices: s
     return graph.node("Sub", [graph.node("Add", [nodes, translations], "nodes.moved"), rotated], "nodes.offsets")
 
 
-def _blend(graph: GraphBuilder, inputs: SupportInputs) -> Blend:
-    """Weighted means of the motions of the nodes that each Gaussian follows."""
-    parts = {"matrices": 9, "offsets": 3, "rots": 4}
-    (matrices, offsets, rots), count = blended_parts(graph, inputs.attributes, _motions(graph, inputs), parts)
+def _blend(graph: GraphBuilder, inputs: SupportInputs) -> tuple[Blend, dict[str, str]]:
+    """Weighted means of the motions of the nodes that each Gaussian follows, and of their `gains`, if there are any."""
+    (matrices, offsets, rots, *gains), count = blended_parts(graph, inputs.attributes, *_motions(graph, inputs))
     axes = rotation_columns(graph, "skinning.axes", inputs.quats)  # constant: computed when the file is opened
     sizes = ((inputs.means, 3), (inputs.quats, 4), (axes, 9))
     means, quats, axes = (columns_of(graph, value, width, count) for value, width in sizes)
-    return Blend(matrices, offsets, rots, means, quats, axes, count)
+    blend = Blend(matrices, offsets, rots, means, quats, axes, count)
+    return blend, rows_of(graph, {"gains": gains[0]}, count) if gains else {}
 
 
 def blended_parts(

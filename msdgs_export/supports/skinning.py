@@ -15,7 +15,7 @@ from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
 from msdgs_train.supports.skinning_kernels import MIN_STRETCH
 
-WIDTHS = {"means": 3, "scales": 3, "quats": 4}
+WIDTHS = {"means": 3, "scales": 3, "quats": 4, "gains": 3}
 
 
 class Affine(NamedTuple):
@@ -80,7 +80,7 @@ def reshaped(graph: GraphBuilder, value: str, shape: tuple[int, ...], output: st
 
 
 def rows_of(graph: GraphBuilder, columns: Mapping[str, str], count: int) -> dict[str, str]:
-    """[R, C] means, scales and quaternions that lie in columns."""
+    """[R, C] means, scales, quaternions and gains that lie in columns."""
     return {part: _rows(graph, value, WIDTHS[part], count) for part, value in columns.items()}
 
 

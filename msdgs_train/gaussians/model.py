@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from msdgs_serve.rasterizer import GSPLAT, RasterizerOptions
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_serve.scene.spherical_harmonics import sh_coefficients
+from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
 from msdgs_train.gaussians.canonical import CanonicalGaussians, GaussianRows
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.modulation import EMBEDDINGS, Modulation
@@ -68,10 +68,11 @@ class DynamicGaussians(nn.Module):
         """
         g = self.gaussians.rows(ids)
         rest = sh_coefficients(self.config.sh_degree if sh_degree is None else sh_degree) - 1
-        sh = torch.cat([g.sh_dc, g.sh_rest if rest == g.sh_rest.shape[1] else g.sh_rest[:, :rest]], dim=1)
+        sh_dc, sh_rest = g.sh_dc, g.sh_rest if rest == g.sh_rest.shape[1] else g.sh_rest[:, :rest]
         points, raw_opacities = points or canonical_points(g), g.raw_opacities
         means, quats = points.means, points.quats
         if not (deform and len(self.deformation) and num_layers != 0):
+            sh = torch.cat([sh_dc, sh_rest], dim=1)
             return PosedGaussians(means, quats, activated_scales(g.log_scales), raw_opacities.sigmoid(), sh)
         if motions is None:
             time = torch.as_tensor(t, dtype=means.dtype, device=means.device)
@@ -82,6 +83,9 @@ class DynamicGaussians(nn.Module):
             deltas = deltas._replace(**{name: f * getattr(deltas, name) for name, f in factors.items()})
         if deltas.opacities is not None:
             raw_opacities = raw_opacities + deltas.opacities
+        if deltas.gains is not None:
+            sh_dc, sh_rest = shaded(sh_dc, sh_rest, deltas.gains[:, None])
+        sh = torch.cat([sh_dc, sh_rest], dim=1)
         if deltas.sh is not None:
             sh = sh + deltas.sh[:, : sh.shape[1]]
         quats = quats + deltas.quats
@@ -114,6 +118,11 @@ class DynamicGaussians(nn.Module):
 def canonical_points(rows: GaussianRows) -> CanonicalPoints:
     """What a support reads of these Gaussians."""
     return CanonicalPoints(rows.means, unit_or_identity(rows.raw_quats), rows.attributes, rows.raw_quats)
+
+
+def shaded(sh_dc: Tensor, sh_rest: Tensor, gains: Tensor) -> tuple[Tensor, Tensor]:
+    """SH of colors that are multiplied by 1 + gains, [N, 1, 3]: a color is 0.5 plus the sum of its bands."""
+    return torch.addcmul(sh_dc, gains, sh_dc + 0.5 / SH_C0), torch.addcmul(sh_rest, gains, sh_rest)
 
 
 def _check_shapes(config: ModelConfig, gaussians: CanonicalGaussians) -> None:

@@ -66,6 +66,7 @@ class LayerStep(NamedTuple):
     weight: Tensor  # [N, 1] in (0, 1); 1 without the head
     delta_opacities: Tensor | None = None  # [N] of logits
     delta_sh: Tensor | None = None  # [N, (degree + 1)², 3]
+    gains: Tensor | None = None  # [N, 3] of red, green and blue, by whose 1 + gain colors are multiplied
     extra: Mapping[str, Tensor] = NO_EXTRA  # [N, ·] outputs of extra heads, by name
 
     @classmethod
@@ -76,13 +77,18 @@ class LayerStep(NamedTuple):
         opacities = opacity[:, 0] if heads.opacity else None
         coefficients = sh.unflatten(1, (heads.sh, 3)) if heads.sh else None
         extra = {name: value for (name, _), value in zip(heads.extra, values, strict=True)}
-        return cls(means, scales, quats, weight, opacities, coefficients, extra)
+        return cls(means, scales, quats, weight, opacities, coefficients, extra=extra)
 
 
 class DeformationLayer(nn.Module):
     """D_k of equation 7: a function of positions and time, of Gaussians or of control nodes."""
 
     kind: ClassVar[str]
+
+    @property
+    def shades(self) -> bool:
+        """Whether it changes colors, by gains."""
+        return False
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
         """Deltas of points at `means`, [N, 3], as moved by the layers before; `t` is a scalar tensor of the same dtype

@@ -18,6 +18,7 @@ class Deltas(NamedTuple):
     quats: Tensor  # [N, 4] wxyz, added to a unit quaternion
     opacities: Tensor | None = None  # [N] of logits; None without that head
     sh: Tensor | None = None  # [N, (degree + 1)², 3]; None without that head
+    gains: Tensor | None = None  # [N, 3], by whose 1 + gain colors are multiplied; None without shading
     extra: Mapping[str, Tensor] = NO_EXTRA  # [N, ·] sums of the support's extra heads, by name
 
     @classmethod
@@ -52,6 +53,7 @@ class MultiStepDeformation(nn.Module):
                 torch.addcmul(deltas.quats, step.weight, step.delta_quats),
                 _sum(deltas.opacities, step.weight[:, 0], step.delta_opacities),
                 _sum(deltas.sh, step.weight[:, :, None], step.delta_sh),
+                _sum(deltas.gains, step.weight, step.gains),
                 {name: step.weight * value + deltas.extra.get(name, 0.0) for name, value in step.extra.items()},
             )
         return deltas

@@ -32,6 +32,15 @@ class SplineConfig(CurveConfig):
     """Learning rate at the last step, to which it decays exponentially."""
     motion_smoothness_weight: float = 0.2
     """Weight of the mean size of second differences along time."""
+    shading: bool = False
+    """Nodes scale colors over time: shading that changes as objects turn, and soft shadows. Only plans that run layers
+    can hold such a model."""
+    shading_lr_init: float = 2e-3
+    """Learning rate of these gains until all times take part."""
+    shading_lr_final: float = 2e-4
+    """Learning rate of these gains at the last step."""
+    shading_smoothness_weight: float = 0.02
+    """Weight of the mean size of their second differences along time."""
 
     def build(self, bounds: SceneBounds, heads: Heads, num_points: int | None) -> "SplineLayer":
         assert num_points is not None  # `check` refuses Gaussians
@@ -43,6 +52,7 @@ class SplineLayer(CurveLayer):
 
     kind = "spline"
     stretches: Tensor
+    gains: nn.Parameter | None
 
     def __init__(self, config: SplineConfig, num_points: int, time_range: tuple[float, float]) -> None:
         super().__init__(config.num_knots, num_points, time_range)
@@ -53,21 +63,39 @@ class SplineLayer(CurveLayer):
             self.stretches = nn.Parameter(stretches)
         else:
             self.register_buffer("stretches", stretches)
+        self.gains = nn.Parameter(torch.zeros(config.num_knots + 3, num_points, 3)) if config.shading else None
+
+    @property
+    def shades(self) -> bool:
+        return self.gains is not None
 
     @property
     def held_curves(self) -> tuple[Tensor, ...]:
-        return self.transls, self.stretches
+        return self.transls, self.stretches, *self._shading
+
+    @property
+    def _shading(self) -> tuple[Tensor, ...]:
+        return () if self.gains is None else (self.gains,)
 
     def forward(self, means: Tensor, t: Tensor) -> LayerStep:
-        transls, rots, stretches = self.values_at(t, self.transls, self.rots, self.stretches)
-        return LayerStep(transls, stretches, rots - identity_like(rots), transls.new_ones(len(transls), 1))
+        transls, rots, stretches, *gains = self.values_at(t, self.transls, self.rots, self.stretches, *self._shading)
+        ones = transls.new_ones(len(transls), 1)
+        return LayerStep(transls, stretches, rots - identity_like(rots), ones, gains=gains[0] if gains else None)
 
     def parameter_groups(self) -> list[ParamGroup]:
-        lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
-        return [ParamGroup("curves", list(self.parameters()), lr)]
+        c = self.config
+        curves = [parameter for parameter in self.parameters() if parameter is not self.gains]
+        groups = [ParamGroup("curves", curves, LearningRate(c.lr_init, c.lr_final, holds=True))]
+        if self.gains is not None:
+            rate = LearningRate(c.shading_lr_init, c.shading_lr_final, holds=True)
+            groups.append(ParamGroup("gains", [self.gains], rate))
+        return groups
 
     def regularizers(self, points: Tensor, t: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-        return {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}
+        terms = {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}
+        for unsteadiness in self.unsteadiness(t, *self._shading):
+            terms["shading_smoothness"] = self.config.shading_smoothness_weight * unsteadiness
+        return terms
 
     def temporal_smoothness(self, t: Tensor) -> Tensor:
         """Mean absolute second difference along time of the four knots around a time; translations count most."""

@@ -24,7 +24,7 @@ from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.placement import farthest_points
 from msdgs_train.layers.quaternions import identity_like, rotation_matrices, stretch_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from msdgs_train.supports.skinning import skin
+from msdgs_train.supports.skinning import blend, skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MOTION
 
 NODE_MIN_OPACITY = 0.3
@@ -99,8 +99,10 @@ class NodesSupport(Support):
             raise InvalidInput("node_ids", f"integers in [0, {self.config.num_nodes})", "others")
 
     def follow(self, gaussians: CanonicalPoints, motions: Tensor) -> Deltas:
-        weights = skinning_weights(gaussians.attributes["skinning_logits"])
-        return Deltas(*skin(gaussians.means, gaussians.quats, weights, gaussians.attributes["node_ids"], motions))
+        weights, ids = skinning_weights(gaussians.attributes["skinning_logits"]), gaussians.attributes["node_ids"]
+        motions, gains = motions.split((MOTION, motions.shape[1] - MOTION), dim=1)
+        deltas = Deltas(*skin(gaussians.means, gaussians.quats, weights, ids, motions))
+        return deltas._replace(gains=blend(gains, weights, ids)) if gains.shape[1] else deltas
 
     def points(self, means: Tensor) -> Tensor:
         return self.nodes
@@ -109,11 +111,12 @@ class NodesSupport(Support):
         return self.transforms(chain(self.nodes, t, num_layers))
 
     def transforms(self, deltas: Deltas) -> Tensor:
-        """[M, 16] matrices, offsets and quaternions of the nodes: x → matrix x + offset."""
+        """[M, 16] matrices, offsets and quaternions of the nodes: x → matrix x + offset; with gains [M, 19]."""
         rots = unit(_quaternions(deltas))
         matrices = rotation_matrices(rots) @ stretch_matrices(deltas.scales)
         offsets = self.nodes + deltas.means - (matrices * self.nodes[:, None]).sum(dim=2)
-        return torch.cat([matrices.flatten(1), offsets, rots], dim=1)
+        gains = [] if deltas.gains is None else [deltas.gains]
+        return torch.cat([matrices.flatten(1), offsets, rots, *gains], dim=1)
 
     @torch.no_grad()
     def on_deform_start(self, gaussians: CanonicalGaussians, surgery: RowSurgery) -> None:
@@ -152,7 +155,7 @@ class NodesSupport(Support):
     def local_rigidity(self, motions: Tensor) -> Tensor:
         """Mean over pairs of neighbors: distance between one as moved by itself and as moved by the other, relative to
         their canonical distance."""
-        matrices, offsets, _ = motions.split((9, 3, 4), dim=1)
+        matrices, offsets = motions[:, :9], motions[:, 9:12]
         near = self.neighbors
         if not near.numel():  # one node
             return motions.new_zeros(())

@@ -36,7 +36,7 @@ from msdgs_train.gaussians.model_file import SceneInfo, load_model
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT
 from msdgs_train.systems.registry import preset
-from tests.support.models import MLP, NODES, PLANE, SCENE, SPLINE, export_scene, random_model, saved
+from tests.support.models import MLP, NODES, PLANE, SCENE, SHADING, SPLINE, export_scene, random_model, saved
 from tests.support.processes import ROOT
 from tests.support.service import serving
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
@@ -84,6 +84,8 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
         (300, {"support": replace(NODES, num_nodes=300), "layers": (replace(SPLINE, affine=False), "mlp")}, 300),
         (300, {"support": replace(NODES, num_nodes=9), "layers": ("bodies", "spline", "mlp"), "noise": 0.03}, 300),
         (300, {"support": NODES, "layers": ("mlp", "bodies"), "embedding_dim": 0}, 300),
+        (300, {"support": replace(NODES, num_nodes=9), "layers": (SHADING, "mlp"), "embedding_dim": 0}, 300),
+        (300, {"support": NODES, "layers": ("mlp", SHADING, SHADING), "sh_degree": 0}, 300),
         (1, {"support": NODES, "layers": ("mlp",)}, 1),
         (0, {"support": NODES, "layers": ("spline",)}, 0),
         (300, {"layers": ()}, 0),

@@ -34,7 +34,19 @@ from msdgs_train.gaussians.model_file import SceneInfo
 from msdgs_train.layers.mlp import MLPLayer
 from tests.support.exports import Parts, parts_of
 from tests.support.images import psnr
-from tests.support.models import CAMERA, GROUND, MLP, NODES, OBJECT, SCENE, moving_object, random_model, rise, saved
+from tests.support.models import (
+    CAMERA,
+    GROUND,
+    MLP,
+    NODES,
+    OBJECT,
+    SCENE,
+    SHADING,
+    moving_object,
+    random_model,
+    rise,
+    saved,
+)
 from tests.support.tolerances import assert_close, tolerance
 
 pytestmark = pytest.mark.slow
@@ -269,6 +281,7 @@ def test_cameras_are_added_where_too_few_are_stored(count: int):
         (40, {"layers": ("plane", "mlp")}, SCENE),
         (40, {"support": NODES, "layers": ("spline",)}, SCENE),
         (40, {"support": NODES, "layers": ("spline", "mlp")}, SCENE),
+        (40, {"support": NODES, "layers": (SHADING,), "noise": 0.2}, SCENE),
         (40, {"support": NODES, "layers": ("mlp", "plane")}, SCENE),
         (40, {"weights": False, "modulation_targets": ("means", "scales", "quats")}, SCENE),
         (40, {"scale_space": "linear"}, SCENE),
@@ -306,6 +319,20 @@ def test_gaussians_that_appear_later_are_kept_and_those_that_never_change_are_st
     assert independent_worst_db(candidate, parts.model, SCENE) >= 50
     written = write_scene(tmp_path / "s.onnx", onnx.load(candidate.path), candidate.pruned.moving, times=4)
     assert written.measured_error["opacities"] <= tolerance("export.relative")
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_shading_is_left_out_if_it_changes_nothing(tmp_path: Path, is_seen: bool):
+    model = random_model(40, noise=0.2, support=NODES, layers=(SHADING, "mlp"), embedding_dim=0)
+    with torch.no_grad():
+        gains = model.get_parameter("deformation.layers.0.gains")
+        gains *= float(is_seen)
+    candidate = exported(tmp_path, model).builder.candidate("network", 50.0)
+    assert candidate.session.scene.changing == (("sh",) if is_seen else ())
+    left_out = {entry["rule"]: entry for entry in candidate.pruned.left_out}
+    assert ("heads" in left_out) != is_seen
+    if not is_seen:
+        assert left_out["heads"]["bytes_saved"] == 4 * gains.numel()
 
 
 @pytest.mark.parametrize("kind", ["spline", "bodies", "mlp", "plane"])

@@ -57,6 +57,7 @@ SCENE = SceneInfo(
 MLP = MLPConfig(width=32, depth=3, time_width=16, time_features=8)
 PLANE = PlaneConfig()
 SPLINE = SplineConfig(num_knots=3)
+SHADING = SplineConfig(num_knots=3, shading=True)
 BODIES = BodiesConfig(num_knots=4, num_bodies=3)
 HASH4D = Hash4DConfig(
     levels=3,

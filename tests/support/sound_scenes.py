@@ -11,7 +11,7 @@ from msdgs_export.importers.sequence import Frames, sequence_scene
 from msdgs_export.plans.registry import build
 from msdgs_export.storage.choice import COARSEST, GROUPS, packed
 from msdgs_export.trajectories.sampling import Trajectories
-from tests.support.models import NODES, SCENE, random_model
+from tests.support.models import NODES, SCENE, SHADING, random_model
 from tests.support.scene_files import write_scene
 from tests.support.splat_files import some_gaussians
 
@@ -23,6 +23,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "spline on nodes": {"layers": ("spline",), "support": NODES},
     "hash4d on nodes": {"layers": ("hash4d", "spline"), "support": NODES},
     "mixed on nodes": {"layers": ("plane", "spline", "mlp"), "support": NODES, "weights": False, "embedding_dim": 0},
+    "shading on nodes": {"layers": (SHADING, "mlp"), "support": NODES, "embedding_dim": 0},
     "static": {"layers": ()},
     **{
         f"all heads of {kind}": {"layers": (kind,), "opacity_head": True, "sh_head": True}
@@ -69,11 +70,13 @@ def _packed() -> Iterator[tuple[str, bytes]]:
         ("mlp", "network"),
         ("hash4d", "network"),
         ("mixed on nodes", "network"),
+        ("shading on nodes", "network"),
         ("mixed", "compact:60"),
         ("static", "network"),
     ):
         baked = bake(random_model(PACKED_COUNT, **MODELS[name]), SCENE, "0" * 64)
-        contents = build(plan, baked, Trajectories(baked, resolved=RESOLVED))
+        fitted = Trajectories(baked, resolved=RESOLVED) if plan != "network" else None
+        contents = build(plan, baked, fitted)
         for kinds in (COARSEST, finest):
             yield f"{name} {plan}, packed in {kinds['quats']}", packed(contents, kinds).SerializeToString()
 

@@ -57,7 +57,9 @@ MODELS = {
     "mlp": SMALL_MODEL,
     "mlp on nodes": dataclasses.replace(SMALL_MODEL, support=NodesConfig(num_nodes=6)),
     "mixed on nodes": dataclasses.replace(
-        SMALL_MODEL, support=NodesConfig(num_nodes=6), layers=(BODIES, SplineConfig(num_knots=8), PLANE, MLP)
+        SMALL_MODEL,
+        support=NodesConfig(num_nodes=6),
+        layers=(BODIES, SplineConfig(num_knots=8, shading=True), PLANE, MLP),
     ),
     "hash4d": dataclasses.replace(SMALL_MODEL, layers=(HASH4D,), scale_space="linear"),
     "mixed on gaussians": dataclasses.replace(SMALL_MODEL, layers=(PLANE, MLP)),

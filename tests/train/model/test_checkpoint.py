@@ -13,7 +13,7 @@ import torch
 from msdgs_train.gaussians.model_file import load_model, save_model
 from msdgs_train.gaussians.safe_load import CheckpointInvalid, load, save_atomic
 from msdgs_train.supports.nodes import NodesConfig
-from tests.support.models import MLP, NODES, SCENE, random_model
+from tests.support.models import MLP, NODES, SCENE, SHADING, random_model
 
 
 @pytest.fixture
@@ -39,6 +39,7 @@ def rewritten(path: Path, part: str | None = None, **changes: object) -> None:
         {"layers": ("plane", "mlp")},
         {"layers": ("spline", "plane", "mlp"), "support": NODES},
         {"layers": ("bodies", "spline"), "support": NODES},
+        {"layers": (SHADING,), "support": NODES},
         {"layers": ("mlp",), "support": NodesConfig(num_nodes=1, k_nearest=3)},
     ],
 )
