@@ -35,9 +35,9 @@ SCENES = ("toybench_100", "toybench_slow_100", "lego_100")
 CHAIN, WIDE = "K layers", "1 layer of as many parameters"
 UNWEIGHTED, MODULATED = "K layers, w = 1", "K layers, modulated"
 COARSE, COARSE_WIDE = "bodies and K - 1 layers", "bodies and 1 layer of as many parameters"
-FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED, COARSE, COARSE_WIDE)
-TIMED = (CHAIN, COARSE)
-"""Those of equal time."""
+FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED)
+WITH_BODIES = (COARSE, COARSE_WIDE)
+"""Of both, the first is that of equal time."""
 GAINS = {
     f"of {CHAIN} over {WIDE}": (CHAIN, WIDE),
     "of w": (CHAIN, UNWEIGHTED),
@@ -54,16 +54,17 @@ def main(
     steps: int | None = None,
     minutes: float | None = None,
     jobs: int = 1,
+    bodies: bool = False,
     check: bool = False,
 ) -> int:
     """Train K = 1, 2, 4 and 10 layers, and one layer of as many parameters as each, with and without step weights and
-    modulation, and with rigid bodies as the first layer; print a table and draw PSNR on test images against K.
+    modulation; print a table and draw PSNR on test images against K.
 
     python -m benchmarks.training.k_steps --csv docs/data/k_steps.csv
 
     Each run has one thread. The bits of a run of a number of steps don't depend on what else the machine does. With
-    `--minutes` the runs are of equal time, and only the K layers themselves are trained, with and without bodies:
-    whether more of them pay although each step takes longer. Runs that have a row in the file are not trained again.
+    `--minutes` the runs are of equal time, and only the K layers themselves are trained: whether more of them pay
+    although each step takes longer. Runs that have a row in the file are not trained again.
 
     Args:
         out: The folder of runs, table and figure.
@@ -73,6 +74,7 @@ def main(
         steps: Optimizer steps of each run; 2,500 without minutes.
         minutes: CPU time of each run, instead of steps.
         jobs: Runs in parallel, no more than the machine has cores.
+        bodies: The first of the K layers are rigid bodies, as in msdgs-bodies, in all runs.
         check: Test this benchmark: widths give equal parameters, and figure and table show what a file holds.
     """
     if check:
@@ -83,8 +85,9 @@ def main(
         if steps is None and minutes is None:
             steps = STEPS
         budget = Budget(steps, minutes, time="cpu")
-        families = FAMILIES if minutes is None else TIMED
-        configs = {name: budget.of(config).updated(eval_every=0) for name, config in systems(families).items()}
+        families = WITH_BODIES if bodies else FAMILIES
+        trained = families if minutes is None else families[:1]
+        configs = {name: budget.of(config).updated(eval_every=0) for name, config in systems(trained).items()}
         runs = make_runs(configs, found, seeds, out)
         with comparison_progress(len(runs_left(runs, csv))) as on_end:
             complete = train_and_measure(runs, csv, processes(jobs), on_end)
@@ -92,11 +95,12 @@ def main(
         report_console().print(f"error: {error}", style="red", markup=False)
         return 1
     rows = rows_of(runs, csv)
-    report(rows, scenes, out / ("k_steps.png" if minutes is None else "k_steps_time.png"), report_console())
+    name = f"k_steps{'_bodies' * bodies}{'_time' * (minutes is not None)}.png"
+    report(rows, scenes, families, out / name, report_console())
     return 0 if complete and len(rows) == len(runs) else 1
 
 
-def systems(families: Sequence[str] = FAMILIES) -> dict[str, TrainConfig]:
+def systems(families: Sequence[str]) -> dict[str, TrainConfig]:
     """The default system with other layers, by the names that `name_of` gives."""
     base = preset(DEFAULT).updated(max_gaussians=18_000, grow_grad2d=8e-4, opacity_reg=None)
     chains = {k: base.updated(layers=(SMALL_LAYER,) * k) for k in NUM_LAYERS}
@@ -128,31 +132,34 @@ def parameters(layer: MLPConfig) -> int:
     return sum(parameter.numel() for parameter in MLPLayer(layer, PAPER_HEADS).parameters())
 
 
-def report(rows: Sequence[Row], scenes: Sequence[str], figure_file: Path, console: Console) -> None:
+def report(
+    rows: Sequence[Row], scenes: Sequence[str], families: Sequence[str], figure_file: Path, console: Console
+) -> None:
     """Print a table of PSNR, also of the moving region where it is known from the images, and one of gains; draw the
     figure."""
-    absolute = table("PSNR on test images, dB", "scene", "K", *FAMILIES, f"moving region, {CHAIN}")
-    gains = table("Gains, dB (95 % over images)", "scene", "K", *GAINS, *(f"of {name} over K = 1" for name in TIMED))
+    first, pairs_of = families[0], {name: pair for name, pair in GAINS.items() if set(pair) <= set(families)}
+    absolute = table("PSNR on test images, dB", "scene", "K", *families, f"moving region, {first}")
+    gains = table("Gains, dB (95 % over images)", "scene", "K", *pairs_of, f"of {first} over K = 1")
     for scene, k in itertools.product(scenes, NUM_LAYERS):
-        values = [psnrs(rows, scene, name_of(family, k)) for family in FAMILIES]
-        values.append(psnrs(rows, scene, name_of(CHAIN, k), "test_moving_psnr"))
+        values = [psnrs(rows, scene, name_of(family, k)) for family in families]
+        values.append(psnrs(rows, scene, name_of(first, k), "test_moving_psnr"))
         absolute.add_row(scene, str(k), *(mean_and_deviation(found, 2) if found else "–" for found in values))
-        pairs = [(name_of(one, k), name_of(other, k)) for one, other in GAINS.values()]
-        pairs += [(name_of(family, k), name_of(family, NUM_LAYERS[0])) for family in TIMED]
+        pairs = [(name_of(one, k), name_of(other, k)) for one, other in pairs_of.values()]
+        pairs.append((name_of(first, k), name_of(first, NUM_LAYERS[0])))
         gains.add_row(scene, str(k), *(gain(rows, [scene], *pair) for pair in pairs))
     console.print(absolute, gains)
     console.print(f"machine: {machines_of(rows)}")
     figure_file.parent.mkdir(parents=True, exist_ok=True)
-    save_figure(draw(rows, scenes), figure_file)
+    save_figure(draw(rows, scenes, families), figure_file)
     console.print(f"wrote {figure_file}")
 
 
-def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
+def draw(rows: Sequence[Row], scenes: Sequence[str], families: Sequence[str]) -> Figure:
     """A panel per scene, a line per family: mean PSNR against K, with bars from the worst seed to the best."""
     figure = Figure(figsize=(1.5 + 3.6 * len(scenes), 4.2), layout="constrained")
     panels = figure.subplots(1, len(scenes), squeeze=False)[0]
     for axes, scene in zip(panels, scenes, strict=True):
-        for family in FAMILIES:
+        for family in families:
             found = {k: psnrs(rows, scene, name_of(family, k)) for k in NUM_LAYERS}
             known = {k: np.array(values) for k, values in found.items() if values}
             if not known:
@@ -164,7 +171,7 @@ def draw(rows: Sequence[Row], scenes: Sequence[str]) -> Figure:
         axes.minorticks_off()
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("PSNR on test images, dB")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize="small")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize="small")
     return figure
 
 
@@ -189,16 +196,18 @@ def self_test() -> int:
             "test_images": f"{29 - index} {31 - index}",
         }
         for scene in SCENES[:2]
-        for index, name in enumerate(list(systems())[:6])
+        for index, name in enumerate(list(systems(FAMILIES))[:6])
     ]
     console = Console(file=io.StringIO(), record=True, width=200)
     with tempfile.TemporaryDirectory() as folder:
-        report(rows, SCENES[:2], Path(folder) / "a.png", console)
+        report(rows, SCENES[:2], FAMILIES, Path(folder) / "a.png", console)
         assert (Path(folder) / "a.png").stat().st_size > 1000
     text = console.export_text()
     assert "+3.00 (+3.00 to +3.00)" in text
     assert text.count("20.00") == 1
-    assert list(systems(TIMED)) == [name_of(family, k) for family in TIMED for k in NUM_LAYERS]
+    assert list(systems(WITH_BODIES)) == [name_of(COARSE, k) for k in NUM_LAYERS] + [name_of(COARSE_WIDE, 4)] + [
+        name_of(COARSE_WIDE, 10)
+    ]
     print("ok: equal parameters, a table and a figure")
     return 0
 
