@@ -17,6 +17,8 @@ class Part(Protocol):
 
 P = TypeVar("P", bound=Part)
 
+SWITCHES = {"true": True, "false": False}
+
 
 def to_plain(part: Part) -> dict[str, Any]:
     """The kind and all settings, ready for JSON."""
@@ -77,7 +79,9 @@ def to_text(part: Part) -> str:
 
 
 def _checked(field: str, value: Any, default: Any) -> Any:
-    """A value of the type of the default; a whole number does for a float, a list for a tuple."""
+    """A value of the type of the default; a whole number does for a float, a list for a tuple, a word for a switch."""
+    if isinstance(default, bool) and str(value).lower() in SWITCHES:
+        return SWITCHES[str(value).lower()]
     if isinstance(default, float) and type(value) is int:
         return float(value)
     if isinstance(default, tuple) and isinstance(value, list):

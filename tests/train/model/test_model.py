@@ -215,6 +215,8 @@ def test_parts_as_text_as_values_and_as_settings_are_the_same():
     config = small_config(layers=(layer, "mlp"))
     assert ModelConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
     assert to_text(MLPConfig()) == "mlp"
+    off = [ModelConfig.from_dict({"support": "nodes", "layers": [f"spline:affine={no}"]}) for no in ("false", "False")]
+    assert all(config.layers == (SplineConfig(affine=False),) for config in off)
     words = ("mlp:width=8,initialization=torch", "mlp:width=8,initialization='torch'")
     assert ModelConfig.from_dict({"layers": words}).layers == (MLPConfig(width=8, initialization="torch"),) * 2
 
