@@ -71,7 +71,7 @@ class SplineLayer(CurveLayer):
 
     @property
     def held_curves(self) -> tuple[Tensor, ...]:
-        return self.transls, self.stretches, *self._shading
+        return self.stretches, *self._shading
 
     @property
     def _shading(self) -> tuple[Tensor, ...]:
