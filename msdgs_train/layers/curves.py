@@ -92,7 +92,7 @@ class CurveLayer(DeformationLayer):
     def on_window(self, before: float, after: float) -> None:
         """Beyond the window, translations and rotations continue at constant speed, and other curves are held.
 
-        Held translations cost 0.4 dB on the toys, whose ball moves by up to its radius from one time to the next.
+        With held translations what moves fast is lost: 3.6 dB on mujoco_7, 0.4 dB on the toys.
         """
         knots = self.num_knots
         known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
