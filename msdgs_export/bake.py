@@ -150,8 +150,8 @@ def starting_cameras(info: SceneInfo) -> tuple[SceneCamera, ...]:
     return tuple(SceneCamera.from_plain(info.cameras[i]) for i in chosen)
 
 
-def changing_outputs(model: DynamicGaussians) -> tuple[str, ...]:
-    """Those of opacities and SH that depend on time."""
-    shades = any(layer.shades for layer in model.deformation)
+def changing_outputs(model: DynamicGaussians, shading: bool = True) -> tuple[str, ...]:
+    """Those of opacities and SH that depend on time, by heads and by shading, which pruning may remove."""
+    shades = shading and any(layer.shades for layer in model.deformation)
     heads = {"opacities": model.config.opacity_head, "sh": model.config.sh_head or shades}
     return tuple(name for name, is_on in heads.items() if is_on and len(model.deformation))

@@ -37,7 +37,7 @@ UNWEIGHTED, MODULATED = "K layers, w = 1", "K layers, modulated"
 COARSE, COARSE_WIDE = "bodies and K - 1 layers", "bodies and 1 layer of as many parameters"
 FAMILIES = (CHAIN, WIDE, UNWEIGHTED, MODULATED)
 WITH_BODIES = (COARSE, COARSE_WIDE)
-"""Of both, the first is that of equal time."""
+"""With --bodies. Of these as of `FAMILIES`, runs of equal time are only of the first."""
 GAINS = {
     f"of {CHAIN} over {WIDE}": (CHAIN, WIDE),
     "of w": (CHAIN, UNWEIGHTED),
@@ -74,7 +74,7 @@ def main(
         steps: Optimizer steps of each run; 2,500 without minutes.
         minutes: CPU time of each run, instead of steps.
         jobs: Runs in parallel, no more than the machine has cores.
-        bodies: The first of the K layers are rigid bodies, as in msdgs-bodies, in all runs.
+        bodies: The first of the K layers is a layer of rigid bodies, as in msdgs-bodies, in all runs.
         check: Test this benchmark: widths give equal parameters, and figure and table show what a file holds.
     """
     if check:
@@ -200,11 +200,14 @@ def self_test() -> int:
     ]
     console = Console(file=io.StringIO(), record=True, width=200)
     with tempfile.TemporaryDirectory() as folder:
-        report(rows, SCENES[:2], FAMILIES, Path(folder) / "a.png", console)
-        assert (Path(folder) / "a.png").stat().st_size > 1000
+        for families in (FAMILIES, WITH_BODIES):
+            named = [row | {"system": name} for row, name in zip(rows, [*systems(families)] * 2, strict=False)]
+            report(named, SCENES[:2], families, Path(folder) / "a.png", console)
+            assert (Path(folder) / "a.png").stat().st_size > 1000
+            (Path(folder) / "a.png").unlink()
     text = console.export_text()
     assert "+3.00 (+3.00 to +3.00)" in text
-    assert text.count("20.00") == 1
+    assert text.count("20.00") == 2
     assert list(systems(WITH_BODIES)) == [name_of(COARSE, k) for k in NUM_LAYERS] + [name_of(COARSE_WIDE, 4)] + [
         name_of(COARSE_WIDE, 10)
     ]

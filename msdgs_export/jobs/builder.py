@@ -49,7 +49,7 @@ class CandidateBuilder:
     def candidate(self, plan: str, pruning_db: float | None, sh_degree: int | None = None) -> Candidate:
         """Write a scene file. Raises `InvalidInput` for a plan that this scene can't have, `PlanUnsafe` for one whose
         round-off would be visible."""
-        check_appearance(plan, changing_outputs(self.model))
+        check_appearance(plan, changing_outputs(self.model, shading=False))
         self._stability.require(plan)
         pruned = self.pruning.at(pruning_db)
         if plan_of(plan).counts_layers:
@@ -57,6 +57,7 @@ class CandidateBuilder:
         if sh_degree is not None:
             pruned = with_sh_degree(pruned, sh_degree)
         baked, trajectories = self._checkpoint.bake(pruned), None
+        check_appearance(plan, baked.scene.changing)
         if plan_of(plan).fitted and len(baked.moving):
             trajectories = self._trajectories.of(baked, pruned)
         self._files += 1

@@ -29,10 +29,9 @@ class SplineExport(CurveLayerExport):
         return graph.node("Mul", [raw, inputs.gate], f"{inputs.name}.gated")
 
     def without_heads(self, layer: DeformationLayer, names: frozenset[str]) -> DeformationLayer:
-        """A copy of the layer that doesn't shade if `GAINS` are removed."""
+        """A copy of the layer that doesn't shade."""
         layer = copy.deepcopy(cast(SplineLayer, layer))
-        if GAINS in names:
-            layer.gains = None
+        layer.gains = None
         return layer
 
     def gains(self, graph: GraphBuilder, inputs: LayerInputs) -> str | None:

@@ -154,9 +154,14 @@ def prefix(baked: Baked, count: int) -> onnx.ModelProto:
     """The scene with its first `count` layers as trained. Raises `InvalidInput` if it has fewer."""
     if count > len(baked.layers):
         raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
-    metadata = replace(baked.scene.metadata, layers=baked.scene.metadata.layers[:count])
-    scene = replace(baked.scene, metadata=metadata)
-    return network(replace(baked, layers=baked.layers[:count], scene=scene), f"prefix:{count}")
+    layers, scene, moving = baked.layers[:count], baked.scene, baked.moving
+    sh = moving.appearance.get("sh")
+    if sh is not None and not heads_of(layers[0]).sh and not any(layer.shades for layer in layers):
+        changing = tuple(name for name in scene.changing if name != "sh")
+        scene = replace(scene, sh=np.concatenate([sh, scene.sh]), changing=changing)
+        moving = replace(moving, appearance={name: moving.appearance[name] for name in changing})
+    scene = replace(scene, metadata=replace(scene.metadata, layers=scene.metadata.layers[:count]))
+    return network(replace(baked, layers=layers, scene=scene, moving=moving), f"prefix:{count}")
 
 
 NETWORK = Plan("network", "network", "#4269d0", lambda baked, spec, sample: network(baked))

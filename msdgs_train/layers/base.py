@@ -66,8 +66,8 @@ class LayerStep(NamedTuple):
     weight: Tensor  # [N, 1] in (0, 1); 1 without the head
     delta_opacities: Tensor | None = None  # [N] of logits
     delta_sh: Tensor | None = None  # [N, (degree + 1)², 3]
-    gains: Tensor | None = None  # [N, 3] of red, green and blue, by whose 1 + gain colors are multiplied
     extra: Mapping[str, Tensor] = NO_EXTRA  # [N, ·] outputs of extra heads, by name
+    gains: Tensor | None = None  # [N, 3] of red, green and blue, by whose 1 + gain colors are multiplied
 
     @classmethod
     def of_columns(cls, columns: Tensor, heads: Heads) -> "LayerStep":
@@ -77,7 +77,7 @@ class LayerStep(NamedTuple):
         opacities = opacity[:, 0] if heads.opacity else None
         coefficients = sh.unflatten(1, (heads.sh, 3)) if heads.sh else None
         extra = {name: value for (name, _), value in zip(heads.extra, values, strict=True)}
-        return cls(means, scales, quats, weight, opacities, coefficients, extra=extra)
+        return cls(means, scales, quats, weight, opacities, coefficients, extra)
 
 
 class DeformationLayer(nn.Module):

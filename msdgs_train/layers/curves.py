@@ -92,7 +92,7 @@ class CurveLayer(DeformationLayer):
     def on_window(self, before: float, after: float) -> None:
         """Beyond the window, translations and rotations continue at constant speed, and other curves are held.
 
-        With held translations what moves fast is lost: 3.6 dB on mujoco_7, 0.4 dB on the toys.
+        With held translations what moves fast is lost: 3.6 dB on mujoco_7 of benchmarks/training/scenes.toml, seed 0.
         """
         knots = self.num_knots
         known = [k for k in range(knots + 3) if abs((k - 1) / knots - 0.5) <= after + 0.5 / knots]
@@ -110,8 +110,8 @@ class CurveLayer(DeformationLayer):
                 self.rots[beyond] = self.rot_lengths * rots.unflatten(0, (2, -1))[end]
 
     def _speeds(self, first: int, last: int) -> Tensor:
-        """[2, C, 3] translations per knot, away from the window, at its first and its last knot: over two intervals
-        inside of these, which fewer images have moved. 0 while there are too few knots."""
+        """[2, C, 3] translations per knot, away from the window, at its first and its last knot: the mean over two
+        intervals next to these, since the outermost knots have been trained least. 0 while there are too few knots."""
         if last - first < 4:
             return torch.zeros_like(self.transls[:2])
         return (self.transls[[first + 1, last - 1]] - self.transls[[first + 3, last - 3]]) / 2

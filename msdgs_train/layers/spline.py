@@ -93,7 +93,8 @@ class SplineLayer(CurveLayer):
 
     def regularizers(self, points: Tensor, t: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
         terms = {"motion_smoothness": self.config.motion_smoothness_weight * self.temporal_smoothness(t)}
-        for unsteadiness in self.unsteadiness(t, *self._shading):
+        if self.gains is not None:
+            (unsteadiness,) = self.unsteadiness(t, self.gains)
             terms["shading_smoothness"] = self.config.shading_smoothness_weight * unsteadiness
         return terms
 

@@ -327,12 +327,27 @@ def test_shading_is_left_out_if_it_changes_nothing(tmp_path: Path, is_seen: bool
     with torch.no_grad():
         gains = model.get_parameter("deformation.layers.0.gains")
         gains *= float(is_seen)
-    candidate = exported(tmp_path, model).builder.candidate("network", 50.0)
+    parts = exported(tmp_path, model)
+    candidate = parts.builder.candidate("network", 50.0)
     assert candidate.session.scene.changing == (("sh",) if is_seen else ())
     left_out = {entry["rule"]: entry for entry in candidate.pruned.left_out}
     assert ("heads" in left_out) != is_seen
     if not is_seen:
         assert left_out["heads"]["bytes_saved"] == 4 * gains.numel()
+        assert not parts.builder.candidate("compact:40", 50.0).session.scene.changing
+    else:
+        with pytest.raises(InvalidInput, match="sh change"):
+            parts.builder.candidate("compact:40", 50.0)
+
+
+def test_a_prefix_without_the_layer_that_shades_has_constant_colors(tmp_path: Path):
+    model = random_model(40, noise=0.2, support=NODES, layers=("mlp", SHADING), embedding_dim=0)
+    parts = exported(tmp_path, model)
+    for plan, changing in (("prefix:1", ()), ("network", ("sh",))):
+        session = parts.builder.candidate(plan, None).session
+        assert session.scene.changing == changing
+        first, last = (session.gaussians(t).sh for t in (0.0, 0.9))
+        assert np.array_equal(first, last) == (plan == "prefix:1")
 
 
 @pytest.mark.parametrize("kind", ["spline", "bodies", "mlp", "plane"])

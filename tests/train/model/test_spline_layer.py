@@ -50,16 +50,26 @@ def test_motions_are_on_splines(t: float) -> None:
 def test_beyond_the_window_translations_and_rotations_continue(config: SplineConfig | BodiesConfig) -> None:
     layer = config.build(SceneBounds(), PAPER_HEADS, 1)
     angles = 0.1 * torch.arange(43)
-    speeds = torch.tensor([1.0, -2.0, 0.5])
+    paths = torch.stack([torch.arange(43.0), -2 * torch.arange(43.0), (torch.arange(43.0) - 15) ** 2], dim=1)
     with torch.no_grad():
-        layer.transls[:, 0] = torch.arange(43.0)[:, None] * speeds
+        layer.transls[:, 0] = paths
+        for curve in layer.held_curves:
+            curve[:] = torch.arange(43.0)[:, None, None]
         layer.rots[:, 0] = torch.stack([(angles / 2).cos(), 0 * angles, 0 * angles, (angles / 2).sin()], dim=1)
     known = layer.rots.detach().clone()
     layer.on_window(0.1, 0.2)
     inside = [k for k in range(43) if abs((k - 1) / 40 - 0.5) <= 0.2 + 0.5 / 40]
-    places = torch.arange(43).clamp(inside[0] - 3, inside[-1] + 3)
-    assert torch.equal(layer.transls.detach()[:, 0], places[:, None] * speeds)
+    first, last = inside[0], inside[-1]
+    places = torch.arange(43).clamp(first - 3, last + 3)
+    want = paths.clone()
+    for end, away, inward in ((first, range(first), 1), (last, range(last + 1, 43), -1)):
+        speed = (paths[end + inward] - paths[end + 3 * inward]) / 2
+        for k in away:
+            want[k] = paths[end] + abs(int(places[k]) - end) * speed
+    assert torch.equal(layer.transls.detach()[:, 0], want)
     assert float((layer.rots.detach() - known[places]).abs().max()) <= tolerance("float32.relative")
+    for curve in layer.held_curves:
+        assert torch.equal(curve.detach()[:, 0, 0], torch.arange(43.0).clamp(first, last))
 
 
 def test_motions_of_few_knots_are_held_beyond_the_window() -> None:
