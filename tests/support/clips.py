@@ -113,7 +113,8 @@ def write_video(file: Path, images: list[np.ndarray], rate: float, sound: np.nda
     """Write [H, W, 3] uint8 images as H.264, and [S] float sound in [-1, 1] at `SAMPLE_RATE` as AAC."""
     with av.open(str(file), "w") as container:
         height, width = images[0].shape[:2]
-        options = {"crf": "18", "preset": "veryfast"}
+        # without asm, whose output differs from run to run and by CPU
+        options = {"crf": "18", "preset": "veryfast", "x264-params": "asm=0"}
         video = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000), options=options)
         video.width, video.height, video.pix_fmt = width, height, "yuv420p"
         audio = None if sound is None else container.add_stream("aac", rate=SAMPLE_RATE, layout="mono")
