@@ -28,6 +28,8 @@ TARGET = np.array([0.0, 0.3, 0.0])
 UP = np.array([0.0, 0.0, 1.0])
 POSTER_SIZE = (1.8, 1.3)  # scene units
 TEXELS = 0.3  # texels of the walls per scene unit and pixel of focal length: about one a pixel
+REPEATABLE = {"x264-params": "asm=0"}
+"""Options of libx264, whose assembly gives other videos from run to run and by CPU."""
 SAMPLE_RATE = 16_000
 CLAP = 0.03  # seconds
 
@@ -113,8 +115,7 @@ def write_video(file: Path, images: list[np.ndarray], rate: float, sound: np.nda
     """Write [H, W, 3] uint8 images as H.264, and [S] float sound in [-1, 1] at `SAMPLE_RATE` as AAC."""
     with av.open(str(file), "w") as container:
         height, width = images[0].shape[:2]
-        # without asm, whose output differs from run to run and by CPU
-        options = {"crf": "18", "preset": "veryfast", "x264-params": "asm=0"}
+        options = {"crf": "18", "preset": "veryfast", **REPEATABLE}
         video = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000), options=options)
         video.width, video.height, video.pix_fmt = width, height, "yuv420p"
         audio = None if sound is None else container.add_stream("aac", rate=SAMPLE_RATE, layout="mono")

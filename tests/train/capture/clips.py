@@ -10,6 +10,8 @@ import numpy as np
 from av.codec.context import Flags
 from av.video.reformatter import Interpolation
 
+from tests.support.clips import REPEATABLE
+
 WIDTH, HEIGHT = 96, 64
 ACCURATE = Interpolation.AREA | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INP
 TICKS = 90_000
@@ -53,7 +55,8 @@ def write_clip(
     times = [index / rate for index in range(len(images))] if times is None else times
     with av.open(str(path), "w", options=muxer or {}) as container:
         container.metadata.update(metadata or {})
-        stream: Any = container.add_stream(codec, rate=rate, options=options or {})
+        repeatable = REPEATABLE if codec == "libx264" else {}
+        stream: Any = container.add_stream(codec, rate=rate, options=repeatable | (options or {}))
         stream.height, stream.width, _ = images[0].shape
         stream.pix_fmt = pixels
         stream.codec_context.time_base = Fraction(1, rate if path.suffix == ".avi" else TICKS)
