@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Collection
 from typing import Any
 
-from msdgs_export.pruning.mask import PruningMask, full_mask, with_network
+from msdgs_export.pruning.mask import PruningMask, full_mask, kept_layers
 from msdgs_export.pruning.rules import RULES
 from msdgs_export.pruning.statistics import PruningStatistics
 from msdgs_export.supports import support_export_of
@@ -46,7 +46,7 @@ def prune(
 def stored_bytes(model: DynamicGaussians, mask: PruningMask) -> int:
     """Approximate size of a file of the plan `network`: Gaussians and layers."""
     gaussian = POSE_BYTES + OPACITY_BYTES + COLOR_BYTES * sh_coefficients(mask.sh_degree)
-    layers = list(with_network(model, mask.network).deformation) if mask.moves.any() else []
+    layers = kept_layers(model, mask.network) if mask.moves.any() else []
     attributes = support_export_of(model.support).bytes_per_gaussian(model.support) if layers else 0
     moving = MODULATION_BYTES * mask.network.modulated + attributes
     weights = 4 * sum(parameter.numel() for layer in layers for parameter in layer.parameters())

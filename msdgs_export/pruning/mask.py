@@ -145,8 +145,6 @@ def _model(
 ) -> DynamicGaussians:
     tensors = {name: parameter.detach()[which] for name, parameter in model.gaussians.named_parameters()}
     tensors["sh_rest"] = tensors["sh_rest"][:, : sh_coefficients(sh_degree) - 1]
-    layers = [list(model.deformation)[k] for k in network.layers]
-    removed = _removable_heads(model) - network.heads
     config = replace(
         model.config,
         layers=tuple(model.config.layers[k] for k in network.layers),
@@ -157,10 +155,16 @@ def _model(
     tensors = {name: values for name, values in tensors.items() if name not in unread}
     with torch.random.fork_rng(devices=[]):  # new layers draw random weights, which are replaced
         smaller = DynamicGaussians(config, CanonicalGaussians(**tensors))
-    smaller.deformation = MultiStepDeformation(_without_heads(layer, removed) for layer in layers)
+    smaller.deformation = MultiStepDeformation(kept_layers(model, network))
     smaller.support = model.support
     smaller.modulation = model.modulation if network.modulated else None
     return smaller.requires_grad_(requires_grad=False)
+
+
+def kept_layers(model: DynamicGaussians, network: NetworkMask) -> list[DeformationLayer]:
+    """The layers of a mask, without the heads that it removes."""
+    removed, layers = _removable_heads(model) - network.heads, list(model.deformation)
+    return [_without_heads(layers[k], removed) for k in network.layers]
 
 
 def _removable_heads(model: DynamicGaussians) -> frozenset[str]:

@@ -24,8 +24,9 @@ from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.placement import farthest_points
 from msdgs_train.layers.quaternions import identity_like, rotation_matrices, stretch_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from msdgs_train.supports.skinning import blend, skin
+from msdgs_train.supports.skinning import skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MOTION
+from msdgs_train.supports.torch_skinning import blend
 
 NODE_MIN_OPACITY = 0.3
 """Gaussians of a larger opacity are candidates for nodes."""
@@ -102,7 +103,7 @@ class NodesSupport(Support):
         weights, ids = skinning_weights(gaussians.attributes["skinning_logits"]), gaussians.attributes["node_ids"]
         motions, gains = motions.split((MOTION, motions.shape[1] - MOTION), dim=1)
         deltas = Deltas(*skin(gaussians.means, gaussians.quats, weights, ids, motions))
-        return deltas._replace(gains=blend(gains, weights, ids)) if gains.shape[1] else deltas
+        return deltas._replace(gains=blend(weights, ids, gains)) if gains.shape[1] else deltas
 
     def points(self, means: Tensor) -> Tensor:
         return self.nodes

@@ -32,12 +32,6 @@ def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Te
     return torch_skinning.skin(means, quats, weights, ids, motions)
 
 
-def blend(values: Tensor, weights: Tensor, ids: Tensor) -> Tensor:
-    """[N, C] weighted sums of the values of nodes, [M, C], with weights and ids as `skin` takes them."""
-    terms = [weights[:, f, None] * values.index_select(0, ids[:, f]) for f in range(ids.shape[1])]
-    return torch.stack(terms).sum(dim=0)
-
-
 class _Skin(torch.autograd.Function):
     """Linear blend skinning by kernels; with torch's matrix products a training step takes 1.14 times as long."""
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from msdgs_train.gaussians.model import DynamicGaussians, shaded
 from msdgs_train.layers.base import PAPER_HEADS, SceneBounds
 from msdgs_train.layers.spline import SplineLayer
-from msdgs_train.supports.skinning import blend
+from msdgs_train.supports.torch_skinning import blend
 from tests.support.models import MLP, NODES, SHADING, random_model
 from tests.support.reference import sh_basis
 from tests.support.reference_deformation import array, plain_curves
@@ -55,7 +55,7 @@ def test_gradients_of_shading() -> None:
     made = [torch.randn(shape, generator=generator, dtype=torch.float64) for shape in ((5, 3), (7, 2))]
     values, weights = (tensor.requires_grad_() for tensor in made)
     ids = torch.randint(5, (7, 2), generator=generator)
-    assert torch.autograd.gradcheck(lambda v, w: blend(v, w, ids), (values, weights))
+    assert torch.autograd.gradcheck(lambda v, w: blend(w, ids, v), (values, weights))
     parts = [torch.randn(7, k, 3, generator=generator, dtype=torch.float64, requires_grad=True) for k in (1, 8, 1)]
     assert torch.autograd.gradcheck(shaded, tuple(parts))
 
