@@ -126,7 +126,7 @@ def _run(options: argparse.Namespace) -> None:
     region = None if options.region is None else Region(*options.region)
     if region:
         for view in views:
-            region.check(view.camera)
+            region.check(view.camera, "--region")
     first = region or views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
     if is_video:

@@ -10,13 +10,13 @@ import numpy as np
 from rich.console import Console
 
 from msdgs_export.importers.detect import frame_files
-from msdgs_export.importers.large import LargeScene
 from msdgs_export.importers.polynomial import at_time, polynomial_scene
 from msdgs_export.importers.runs.model import write_model
 from msdgs_export.importers.scene import digest, static_baked, static_scene, write_imported
 from msdgs_export.importers.sequence import posed, read_sequence, sequence_scene, shown_rows
 from msdgs_export.importers.splats.formats import READERS, read_splats
 from msdgs_export.importers.splats.sog import META
+from msdgs_export.importers.static_file import StaticSceneFile
 from msdgs_export.progress import tracked
 from msdgs_export.storage.choice import MAX_VALUES
 from msdgs_serve.scene.baked import BakedScene
@@ -69,7 +69,7 @@ def _splats(job: Import, console: Console) -> BakedScene:
         source = source if job.up is None else replace(source, up=job.up)
         values = sum(array.size for array in vars(source.gaussians).values())
         if source.motion is None and (job.min_psnr is None or values > MAX_VALUES):
-            scene = LargeScene(static_baked(source, digest(path)))
+            scene = StaticSceneFile(static_baked(source, digest(path)))
             del source  # its opacities and SH are released while the file is written
             return scene.write(job.output)
         if source.motion is None:

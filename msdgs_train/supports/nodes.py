@@ -18,13 +18,12 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.scale_space import ScaleSpace
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.arrays import to_array
-from msdgs_train.layers.base import check_size
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.placement import farthest_points
 from msdgs_train.layers.quaternions import identity_like, rotation_matrices, stretch_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
-from msdgs_train.supports.skinning import skin
+from msdgs_train.supports.skinning import check_nodes, skin
 from msdgs_train.supports.skinning_kernels import MAX_NEAREST, MOTION
 from msdgs_train.supports.torch_skinning import blend
 
@@ -62,10 +61,7 @@ class NodesConfig(SupportConfig):
         return NodesSupport(self)
 
     def check(self, field: str) -> None:
-        check_size(f"{field}.num_nodes", self.num_nodes)
-        check_size(f"{field}.k_nearest", self.k_nearest)
-        if self.k_nearest > MAX_NEAREST:
-            raise InvalidInput(f"{field}.k_nearest", f"at most {MAX_NEAREST}", self.k_nearest)
+        check_nodes(field, self.num_nodes, self.k_nearest)
 
     @property
     def followed(self) -> int:

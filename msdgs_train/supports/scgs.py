@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding
 
-from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.quaternion import MIN_NORM
 from msdgs_train.gaussians.attribute import Attribute
 from msdgs_train.gaussians.scale_space import ScaleSpace
@@ -28,7 +27,7 @@ from msdgs_train.layers.placement import farthest_points
 from msdgs_train.layers.quaternions import rotation_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
 from msdgs_train.supports.nearest import nearest
-from msdgs_train.supports.skinning_kernels import MAX_NEAREST
+from msdgs_train.supports.skinning import check_nodes
 
 GAUSSIAN_HYPER, NODE_HYPER = -1e-2, 1e-2
 """Initial hyper coordinates of Gaussians and of nodes."""
@@ -65,10 +64,8 @@ class SCGSConfig(SupportConfig):
         return SCGSSupport(self)
 
     def check(self, field: str) -> None:
-        for name in ("num_nodes", "k_nearest", "hyper_dim"):
-            check_size(f"{field}.{name}", getattr(self, name))
-        if self.k_nearest > MAX_NEAREST:
-            raise InvalidInput(f"{field}.k_nearest", f"at most {MAX_NEAREST}", self.k_nearest)
+        check_nodes(field, self.num_nodes, self.k_nearest)
+        check_size(f"{field}.hyper_dim", self.hyper_dim)
 
     @property
     def followed(self) -> int:

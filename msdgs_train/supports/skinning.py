@@ -8,11 +8,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.rasterizer.projection import part_range
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.threads import run_parallel
 from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
+from msdgs_train.layers.base import check_size
 from msdgs_train.supports import torch_skinning
-from msdgs_train.supports.skinning_kernels import skin_backward, skin_forward
+from msdgs_train.supports.skinning_kernels import MAX_NEAREST, skin_backward, skin_forward
 
 PARTS = 4  # that the rows are split into; fixed, so that sums have the same order whatever the number of threads
 
@@ -30,6 +32,14 @@ def skin(means: Tensor, quats: Tensor, weights: Tensor, ids: Tensor, motions: Te
     if arrays.has_kernels(means):
         return _Skin.apply(means, quats, weights.T, ids, motions)
     return torch_skinning.skin(means, quats, weights, ids, motions)
+
+
+def check_nodes(field: str, num_nodes: int, k_nearest: int) -> None:
+    """Raise `InvalidInput` unless Gaussians can follow `k_nearest` of so many nodes, or all if there are fewer."""
+    check_size(f"{field}.num_nodes", num_nodes)
+    check_size(f"{field}.k_nearest", k_nearest)
+    if k_nearest > MAX_NEAREST:
+        raise InvalidInput(f"{field}.k_nearest", f"at most {MAX_NEAREST}", k_nearest)
 
 
 class _Skin(torch.autograd.Function):

@@ -122,7 +122,7 @@ def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
         (["scene", "video.webp", "--width", "16384", "--height", "2"], "width"),
         (["scene", "taken"], "an empty folder"),
         (["missing.onnx", "out"], "missing.onnx"),
-        (["scene", "out", "--region", "0", "0", "9999", "1"], "region"),
+        (["scene", "out", "--region", "0", "0", "9999", "1"], "--region"),
         (["scene", "out", "--quality", "80"], "quality"),
     ],
 )

@@ -19,7 +19,7 @@ from msdgs_serve.scene.onnx.write import Message
 from msdgs_serve.writing import replacing
 
 
-class LargeScene:
+class StaticSceneFile:
     """The scene file of a static scene, which is written from its arrays. The bytes are those of `build`."""
 
     def __init__(self, scene: BakedScene) -> None:
