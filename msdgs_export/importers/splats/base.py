@@ -76,13 +76,11 @@ class Stored(NamedTuple):
     sh: np.ndarray  # [N, C, 3]
     motion: np.ndarray | None = None  # [N, 15], kept as it is
 
-    def parts(self) -> Iterator["Stored"]:
-        """The same in parts of `ROWS`, at least one."""
-        for start in range(0, max(len(self.means), 1), ROWS):
-            rows = slice(start, start + ROWS)
-            motion = None if self.motion is None else self.motion[rows]
-            posed = (self.means[rows], self.log_scales[rows], self.raw_quats[rows])
-            yield Stored(*posed, self.opacities[rows], self.sh[rows], motion)
+
+def parts_of(count: int) -> Iterator[slice]:
+    """So many rows in parts of `ROWS`, at least one part."""
+    for start in range(0, max(count, 1), ROWS):
+        yield slice(start, min(start + ROWS, count))
 
 
 def splats(

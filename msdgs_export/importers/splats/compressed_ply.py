@@ -1,12 +1,13 @@
 """SuperSplat's compressed PLY: positions 11-10-11 bits and scales within ranges of 256 Gaussians, colors and opacities
 8 bits each."""
 
+from itertools import repeat
 from pathlib import Path
 
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed
-from msdgs_export.importers.splats.base import Splats, Stored, smallest_three, splats
+from msdgs_export.importers.splats.base import ROWS, Splats, Stored, smallest_three, splats
 from msdgs_export.importers.splats.ply_columns import Columns, rest_of
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 
@@ -23,9 +24,17 @@ def compressed(file: Path, vertex: Columns, chunk: Columns | None, bands: Column
     """
     if chunk is None:
         raise ImportFailed(file, "is a compressed PLY without its element `chunk`")
-    of = np.arange(vertex.rows) // CHUNK
     if chunk.rows * CHUNK < vertex.rows:
         raise ImportFailed(file, f"has {chunk.rows:,} rows of `chunk` for {vertex.rows:,} Gaussians")
+    if bands is not None and bands.rows != vertex.rows:
+        raise ImportFailed(file, f"has {bands.rows:,} rows of `sh` for {vertex.rows:,} Gaussians")
+    rests = repeat(None) if bands is None else bands.parts(ROWS)
+    parts = zip(vertex.parts(ROWS), chunk.parts(ROWS // CHUNK), rests, strict=False)  # there may be more chunks
+    return splats(file, vertex.rows, (_stored(file, *part) for part in parts))
+
+
+def _stored(file: Path, vertex: Columns, chunk: Columns, bands: Columns | None) -> Stored:
+    of = np.arange(vertex.rows) // CHUNK
 
     def within(low: str, high: str, parts: np.ndarray) -> np.ndarray:
         first, last = (chunk.named(*(f"{end}{axis}" for axis in low[-3:]))[of] for end in (low[:-3], high[:-3]))
@@ -38,17 +47,14 @@ def compressed(file: Path, vertex: Columns, chunk: Columns | None, bands: Column
     small = (_bits(packed, (20, 10), (10, 10), (0, 10)) - 0.5) * np.sqrt(2)
     sh = ((rgb - 0.5) / SH_C0)[:, None]
     if bands is not None:
-        if bands.rows != vertex.rows:
-            raise ImportFailed(file, f"has {bands.rows:,} rows of `sh` for {vertex.rows:,} Gaussians")
         sh = np.concatenate([sh, rest_of(file, bands, lambda name: _byte_sh(bands.read(name)))], axis=1)
-    stored = Stored(
+    return Stored(
         within("min_xyz", "max_xyz", _bits(vertex.packed("packed_position"), *ELEVEN)),
         within("min_scale_xyz", "max_scale_xyz", _bits(vertex.packed("packed_scale"), *ELEVEN)),
         smallest_three(small, packed >> 30),
         colors[:, 3],
         sh,
     )
-    return splats(file, vertex.rows, stored.parts())
 
 
 def _bits(packed: np.ndarray, *fields: tuple[int, int]) -> np.ndarray:

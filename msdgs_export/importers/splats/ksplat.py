@@ -1,14 +1,14 @@
 """`.ksplat` 0.1, the format of mkkellogg's viewer: a header, headers of sections, and Gaussians in buckets."""
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed, cut_off
-from msdgs_export.importers.splats.base import Splats, Stored, splats
+from msdgs_export.importers.splats.base import Splats, Stored, parts_of, splats
 from msdgs_serve.scene.fields import FieldTable
 from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
 
@@ -100,20 +100,19 @@ def read_ksplat(file: Path) -> Splats:
     if data > len(contents):
         raise cut_off(file, f"the headers of {header.max_sections:,} sections", data, len(contents))
     is_defined = not any(contents[2:4]) and not any(contents[HEADER.size : HEADER_BYTES])
-    parts: list[Stored] = []
+    sections: list[tuple[Section, np.ndarray, np.ndarray]] = []
     for number in range(header.max_sections):
         at = HEADER_BYTES + SECTION_BYTES * number
         is_defined &= not any(contents[at + SECTION.size : at + SECTION_BYTES])
         section = Section(number, *SECTION.unpack_from(contents, at))
         end = _end(file, header.level, section, contents, data)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            parts.append(_decoded(file, header, section, contents, data))
+        sections.append((section, *_rows(file, header.level, section, contents, data)))
         data = end
-    found = sum(len(part.means) for part in parts)
-    if not parts or found != header.count:
-        raise ImportFailed(file, f"states {header.count:,} Gaussians; its {len(parts):,} sections have {found:,}")
+    found = sum(section.count for section, *_ in sections)
+    if not sections or found != header.count:
+        raise ImportFailed(file, f"states {header.count:,} Gaussians; its {len(sections):,} sections have {found:,}")
     warning = "it has bytes that version 0.1 doesn't define; they are left out"
-    return splats(file, found, _of_one_degree(parts), warnings=() if is_defined else (warning,))
+    return splats(file, found, _parts(header, sections), warnings=() if is_defined else (warning,))
 
 
 def _record(level: int, sh_degree: int) -> np.dtype:
@@ -147,14 +146,28 @@ def _end(file: Path, level: int, section: Section, contents: bytes, start: int) 
     return start + size
 
 
-def _decoded(file: Path, header: Header, section: Section, contents: bytes, start: int) -> Stored:
-    """The Gaussians of one section."""
+def _rows(file: Path, level: int, section: Section, contents: bytes, start: int) -> tuple[np.ndarray, np.ndarray]:
+    """The records of a section and, above level 0, the centers of their buckets, [n, 3]."""
     skipped = 4 * section.partial_buckets + BUCKET_BYTES * section.buckets
-    rows = np.frombuffer(contents, _record(header.level, section.sh_degree), section.count, start + skipped)
+    rows = np.frombuffer(contents, _record(level, section.sh_degree), section.count, start + skipped)
+    return rows, _centers(file, section, contents, start) if level else np.empty((len(rows), 0), np.float32)
+
+
+def _parts(header: Header, sections: Sequence[tuple[Section, np.ndarray, np.ndarray]]) -> Iterator[Stored]:
+    """The Gaussians of all sections in parts; SH that a section doesn't have are 0."""
+    widest = max(sh_coefficients(section.sh_degree) for section, *_ in sections)
+    for section, records, centers in sections:
+        for rows in parts_of(len(records)):
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                part = _decoded(header, section, records[rows], centers[rows])
+            yield part._replace(sh=np.pad(part.sh, ((0, 0), (0, widest - part.sh.shape[1]), (0, 0))))
+
+
+def _decoded(header: Header, section: Section, rows: np.ndarray, centers: np.ndarray) -> Stored:
     means = rows["means"].astype(np.float64)
     if header.level:
         steps = section.scale_range or SCALE_RANGE
-        means = (means - steps) * (section.block_size / 2 / steps) + _centers(file, section, contents, start)
+        means = (means - steps) * (section.block_size / 2 / steps) + centers
     rgba, rest = rows["rgba"] / 255, rows["sh"].astype(np.float64)
     if header.level == 2:
         low, high = header.min_sh or -SH_LIMIT, header.max_sh or SH_LIMIT
@@ -180,11 +193,3 @@ def _centers(file: Path, section: Section, contents: bytes, start: int) -> np.nd
     centers = np.frombuffer(contents, "<f4", 3 * section.buckets, start + lengths.size * 4).reshape(-1, 3)
     ends = np.cumsum(np.concatenate([np.full(section.full_buckets, section.bucket_size), lengths]))
     return centers[np.searchsorted(ends, np.arange(section.count), side="right")]
-
-
-def _of_one_degree(sections: list[Stored]) -> Iterator[Stored]:
-    """The sections in parts; SH that a section doesn't have are 0."""
-    widest = max(section.sh.shape[1] for section in sections)
-    for section in sections:
-        for part in section.parts():
-            yield part._replace(sh=np.pad(part.sh, ((0, 0), (0, widest - part.sh.shape[1]), (0, 0))))

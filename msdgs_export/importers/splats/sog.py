@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed
-from msdgs_export.importers.splats.base import Splats, Stored, smallest_three, splats
+from msdgs_export.importers.splats.base import Splats, Stored, parts_of, smallest_three, splats
 from msdgs_export.importers.splats.webp import read_texture
 from msdgs_serve.scene.fields import FieldTable
 
@@ -187,22 +187,25 @@ def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
             raise ImportFailed(path, f"its texture {name} has {len(shown):,} pixels for {least:,} numbers")
         return shown[:least]
 
-    low, high = (texture(name, count)[:, :3].astype(np.int64) for name in meta.files("means", 2))
+    low, high = (texture(name, count) for name in meta.files("means", 2))
     first, last = meta.numbers("means.mins", 3), meta.numbers("means.maxs", 3)
-    logs = first + (last - first) * (low | high << 8) / 65535
-    with np.errstate(over="ignore"):
-        means = np.sign(logs) * np.expm1(np.abs(logs))
-    scales = texture(meta.files("scales", 1)[0], count)[:, :3]
-    colors = texture(meta.files("sh0", 1)[0], count)
-    sh = meta.numbers("sh0.codebook", 256)[colors[:, None, :3]]
+    scales, colors, quats = (texture(meta.files(name, 1)[0], count) for name in ("scales", "sh0", "quats"))
+    of_scales, of_colors = (meta.numbers(f"{name}.codebook", 256) for name in ("scales", "sh0"))
+    entries, labels = np.empty((1, 0, 3)), np.zeros(count, np.uint16)
     if meta.get("shN") is not None:
-        sh = np.concatenate([sh, _harmonics(path, meta, count, texture)], axis=1)
-    quats = texture(meta.files("quats", 1)[0], count)
-    scales = meta.numbers("scales.codebook", 256)[scales]
+        entries, labels = _harmonics(path, meta, count, texture)
+
+    def part(rows: slice) -> Stored:
+        steps = low[rows, :3].astype(np.int64) | high[rows, :3].astype(np.int64) << 8
+        logs = first + (last - first) * steps / 65535
+        with np.errstate(over="ignore"):
+            means = np.sign(logs) * np.expm1(np.abs(logs))
+        sh = np.concatenate([of_colors[colors[rows, None, :3]], entries[labels[rows]]], axis=1)
+        return Stored(means, of_scales[scales[rows, :3]], _quats(quats[rows]), colors[rows, 3] / 255, sh)
+
     antialiasing, warnings = _model(meta)
     warnings += [f"{META} has `{name}`, which isn't known and is left out" for name in FIELDS.unlisted(meta.names())]
-    stored = Stored(means, scales, _quats(quats), colors[:, 3] / 255, sh)
-    return splats(path, len(means), stored.parts(), antialiasing, tuple(warnings))
+    return splats(path, count, map(part, parts_of(count)), antialiasing, tuple(warnings))
 
 
 def _model(meta: _Meta) -> tuple[str, list[str]]:
@@ -224,15 +227,18 @@ def _quats(stored: np.ndarray) -> np.ndarray:
     return quats
 
 
-def _harmonics(path: Path, meta: _Meta, count: int, texture: Callable[[str, int], np.ndarray]) -> np.ndarray:
-    """[N, C − 1, 3]: each Gaussian has the index of a palette entry, whose bytes are indices into a codebook."""
+def _harmonics(
+    path: Path, meta: _Meta, count: int, texture: Callable[[str, int], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """SH above degree 0 of a palette, [P, C − 1, 3], and the entry of each Gaussian, [N]. A palette's bytes are indices
+    into a codebook."""
     bands = meta.whole("shN.bands", 3)
     palette = meta.whole("shN.count", 1 << 16)
     centroids, labels = meta.files("shN", 2)
     wide = ENTRIES_PER_ROW * COEFFICIENTS[bands]
     entries = texture(centroids, wide * -(-palette // ENTRIES_PER_ROW))[:, :3].reshape(-1, COEFFICIENTS[bands], 3)
-    stored = texture(labels, count).astype(np.int64)
+    stored = texture(labels, count).astype(np.uint16)
     label = stored[:, 0] | stored[:, 1] << 8
     if label.max() >= palette:
         raise ImportFailed(path, f"a Gaussian has SH entry {label.max():,} of a palette of {palette:,}")
-    return meta.numbers("shN.codebook", 256)[entries[label]]
+    return meta.numbers("shN.codebook", 256)[entries], label

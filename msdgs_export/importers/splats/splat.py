@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed
-from msdgs_export.importers.splats.base import Splats, Stored, splats
+from msdgs_export.importers.splats.base import Splats, Stored, parts_of, splats
 from msdgs_serve.scene.fields import FieldTable
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 
@@ -25,9 +25,13 @@ def read_splat(file: Path) -> Splats:
             file, f"is cut off or no .splat: {size:,} bytes aren't a multiple of 32, which each Gaussian has"
         )
     records = np.fromfile(file, RECORD)
+    return splats(file, len(records), (_stored(records[rows]) for rows in parts_of(len(records))))
+
+
+def _stored(records: np.ndarray) -> Stored:
     rgba = records["rgba"] / 255
     quats = (records["quats"].astype(np.float64) - 128) / 128
     with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(records["scales"].astype(np.float64))
     dc = ((rgba[:, :3] - 0.5) / SH_C0)[:, None]
-    return splats(file, len(records), Stored(records["means"], log_scales, quats, rgba[:, 3], dc).parts())
+    return Stored(records["means"], log_scales, quats, rgba[:, 3], dc)

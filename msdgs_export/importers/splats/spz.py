@@ -1,14 +1,16 @@
 """`.spz`, versions 2, 3 and 4. Axes are right, up, back, or those of an extension."""
 
 import struct
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from msdgs_export.importers.errors import ImportFailed, cut_off
 from msdgs_export.importers.splats.axes import from_right_up_back
-from msdgs_export.importers.splats.base import Splats, Stored, smallest_three, splats
+from msdgs_export.importers.splats.base import Splats, Stored, parts_of, smallest_three, splats
 from msdgs_export.importers.splats.coordinate_systems import MISNAMED, SYSTEMS, from_system
 from msdgs_export.importers.splats.spz_container import (
     EXTENSIONS,
@@ -108,32 +110,45 @@ def _leaves(file: Path, count: int, tree: bytes) -> np.ndarray:
 def _decoded(file: Path, found: Container, leaves: np.ndarray | None, system: str | None) -> Splats:
     """The Gaussians, converted to the axes of a PLY if `system` names theirs."""
     header = found.header
-    positions, alphas, colors, scales, rotations, rest = (np.frombuffer(part, np.uint8) for part in found.parts)
     n = header.count
+    arrays = [np.frombuffer(part, np.uint8) for part in found.parts]
+    columns = [array.reshape(n, array.size // max(n, 1)) for array in arrays]
+    leaf_rows = None if leaves is None else np.flatnonzero(leaves)
+    count = n if leaf_rows is None else len(leaf_rows)
+
+    def part(rows: slice) -> Stored:
+        read = rows if leaf_rows is None else leaf_rows[rows]
+        stored = _part(header, [column[read] for column in columns])
+        if leaves is not None:  # opacities are halved, since those of inner nodes may be above 1
+            stored = stored._replace(opacities=np.minimum(2 * stored.opacities, 1))
+        if system is None:
+            return stored
+        turned = from_right_up_back if system == DEFAULT_SYSTEM else partial(from_system, system)
+        means, quats, sh = turned(stored.means, stored.raw_quats, stored.sh)
+        return stored._replace(means=means, raw_quats=quats, sh=sh)
+
+    return splats(file, count, map(part, parts_of(count)), "mip" if header.flags & MIP else "dilate")
+
+
+def _part(header: Header, columns: Sequence[np.ndarray]) -> Stored:
+    """Gaussians of these bytes, [n, ·] of each part of the file."""
+    positions, alphas, colors, scales, rotations, rest = columns
+    n = len(positions)
     low, middle, high = positions.reshape(n, 3, 3).astype(np.int32).transpose(2, 0, 1)
     fixed = ((low | middle << 8 | high << 16) ^ 0x800000) - 0x800000  # two's complement of 24 bits
-    dc = (colors.reshape(n, 1, 3) / 255 - 0.5) / COLOR_SCALE
-    sh = np.concatenate([dc, (rest.reshape(n, -1, 3).astype(np.float64) - 128) / 128], axis=1)
-    means, quats = fixed / 2**header.fractional_bits, _quats(header, rotations)
-    log_scales, opacities = scales.reshape(n, 3) / 16 - 10, alphas / 255
-    if leaves is not None:  # opacities are halved, since those of inner nodes may be above 1
-        means, log_scales, quats, sh = (array[leaves] for array in (means, log_scales, quats, sh))
-        opacities = np.minimum(2 * opacities[leaves], 1)
-    if system == DEFAULT_SYSTEM:
-        means, quats, sh = from_right_up_back(means, quats, sh)
-    elif system is not None:
-        means, quats, sh = from_system(system, means, quats, sh)
-    stored = Stored(means, log_scales, quats, opacities, sh)
-    return splats(file, len(means), stored.parts(), "mip" if header.flags & MIP else "dilate")
+    dc = (colors[:, None] / 255 - 0.5) / COLOR_SCALE
+    rest = (rest.reshape(n, rest.shape[1] // 3, 3).astype(np.float64) - 128) / 128
+    means, log_scales = fixed / 2**header.fractional_bits, scales / 16 - 10
+    return Stored(means, log_scales, _quats(header, rotations), alphas[:, 0] / 255, np.concatenate([dc, rest], axis=1))
 
 
 def _quats(header: Header, rotations: np.ndarray) -> np.ndarray:
     """[N, 4] wxyz. Version 2 stores x, y, z in bytes, later ones the three smallest in a sign and 9 bits each."""
     if header.version == 2:
-        xyz = rotations.reshape(-1, 3) / 127.5 - 1
+        xyz = rotations / 127.5 - 1
         w = np.sqrt(np.maximum(0, 1 - np.square(xyz).sum(axis=1)))
         return np.concatenate([w[:, None], xyz], axis=1)
-    packed = rotations.view("<u4")
+    packed = np.ascontiguousarray(rotations).view("<u4")[:, 0]
     fields = np.stack([packed >> 20, packed >> 10, packed], axis=1) & 1023
     small = (fields & 511) * np.where(fields & 512, -1, 1) * (np.sqrt(0.5) / 511)
     return smallest_three(small, packed >> 30)[:, [3, 0, 1, 2]]
