@@ -36,6 +36,8 @@ from msdgs_serve.writing import in_words, replacing, write_text, writing
 
 PROGRAM = "msdgs-render"
 RECORD = "msdgs-render.json"
+OPTIONS = ("elevation", "width", "height", "region", "fps", "quality")
+"""Those whose values are checked where they are used, by these names."""
 
 DESCRIPTION = """\
 Render a camera path through scenes as images or a video, on this machine or a Ray cluster.
@@ -58,9 +60,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"\n{PROGRAM}: stopped; the same command continues from here", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (MsdgsError, OSError) as error:
-        print(f"{PROGRAM}: {in_words(error)}", file=sys.stderr)
+        print(f"{PROGRAM}: {in_words(_by_option(error, options))}", file=sys.stderr)
         return EXIT_INVALID
     return 0
+
+
+def _by_option(error: MsdgsError | OSError, options: argparse.Namespace) -> MsdgsError | OSError:
+    """The error, with the name of the option that gave the invalid value, if one did."""
+    if isinstance(error, InvalidInput):
+        name = error.field.removeprefix("camera.")
+        if name in OPTIONS and getattr(options, name) is not None:
+            return error.renamed(f"--{name}")
+    return error
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -126,7 +137,7 @@ def _run(options: argparse.Namespace) -> None:
     region = None if options.region is None else Region(*options.region)
     if region:
         for view in views:
-            region.check(view.camera, "--region")
+            region.check(view.camera)
     first = region or views[0].camera
     check_encodable(first.width, first.height, transparent, image_format, options.quality)
     if is_video:

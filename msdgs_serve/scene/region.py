@@ -27,10 +27,10 @@ class Region(NamedTuple):
     def bottom(self) -> int:
         return self.y + self.height
 
-    def check(self, camera: Camera, field: str = "region") -> None:
-        """Raise `InvalidInput` that names `field` unless it is a part of the camera's image, of a pixel at least."""
+    def check(self, camera: Camera) -> None:
+        """Raise `InvalidInput` unless this is a part of the camera's image, of at least one pixel."""
         is_whole = all(type(number) is int for number in self)
         is_inside = is_whole and min(self.x, self.y) >= 0 and min(self.width, self.height) >= 1
         if not (is_inside and self.right <= camera.width and self.bottom <= camera.height):
             expected = f"x, y, width and height of a part of the image of {camera.width} × {camera.height} pixels"
-            raise InvalidInput(field, expected, list(self))
+            raise InvalidInput("region", expected, list(self))
