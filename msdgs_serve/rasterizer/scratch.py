@@ -16,7 +16,9 @@ MAX_WASTE = 4
 """An array may take memory of up to so many times its size."""
 CACHE_LINE_BYTES = 64
 
-_unused: dict[int, np.ndarray] = {}  # by identity, oldest first; single operations of a dict are atomic
+_unused: dict[int, np.ndarray] = {}
+"""By identity, oldest first. Single operations are atomic, but before Python 3.12 `list(_unused.items())` isn't: its
+tuples may start a garbage collection, which ends the last use of other arrays."""
 
 
 def scratch(shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
@@ -54,9 +56,9 @@ def _view(memory: np.ndarray, shape: tuple[int, ...], dtype: npt.DTypeLike) -> n
 
 
 def _taken(size: int) -> np.ndarray:
-    newest_first = reversed(list(_unused.items()))  # what was used last may be in a cache
-    for key, memory in sorted(newest_first, key=lambda item: item[1].nbytes):
-        if size <= memory.nbytes <= MAX_WASTE * size and _unused.pop(key, None) is not None:
+    newest_first = reversed(list(_unused.values()))  # what was used last may be in a cache
+    for memory in sorted(newest_first, key=lambda memory: memory.nbytes):
+        if size <= memory.nbytes <= MAX_WASTE * size and _unused.pop(id(memory), None) is not None:
             return memory
     return np.empty(size, np.uint8)
 
@@ -66,6 +68,6 @@ def _keep(memory: np.ndarray) -> None:
         return
     _unused[id(memory)] = memory
     excess = unused_bytes() - KEPT_BYTES
-    for key, oldest in list(_unused.items()):
-        if excess > 0 and _unused.pop(key, None) is not None:
+    for oldest in list(_unused.values()):
+        if excess > 0 and _unused.pop(id(oldest), None) is not None:
             excess -= oldest.nbytes

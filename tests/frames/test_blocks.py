@@ -104,7 +104,7 @@ def test_frames_per_second_that_cannot_be_are_refused_before_drawing(
     folder: Path, fps: str, capsys: pytest.CaptureFixture[str]
 ):
     assert main([str(folder / "views.json"), str(folder / "out.mp4"), "--fps", fps]) == 2
-    assert "`fps` must be in" in capsys.readouterr().err
+    assert "`--fps` must be in" in capsys.readouterr().err
     assert not (folder / "out.mp4.frames").exists()
 
 

@@ -1,5 +1,6 @@
 """Memory of intermediate arrays is lent again, never twice at once."""
 
+import gc
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -67,6 +68,25 @@ def test_threads_never_share_memory():
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(work, range(1, 9)))
+
+
+def test_arrays_may_end_in_a_garbage_collection_at_any_moment():
+    thresholds = gc.get_threshold()
+    try:
+        for allocations in range(4, 44, 4):  # before the next collection
+            release_scratch()
+            kept = [scratch((1_000 * k,), np.uint8) for k in range(1, 31)]
+            array = scratch((500_000,), np.uint8)
+            del kept
+            gc.collect()
+            cycle: list = [array]
+            cycle.append(cycle)
+            del cycle, array
+            gc.set_threshold(allocations)
+            assert scratch((8,), np.float64).shape == (8,)
+            gc.set_threshold(*thresholds)
+    finally:
+        gc.set_threshold(*thresholds)
 
 
 def test_what_is_kept_between_frames_has_memory_of_its_own():
