@@ -3,10 +3,13 @@
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+from msdgs_train.datasets.common.scene_data import SceneData
 from msdgs_train.datasets.common.times import EXPECTED, is_time_from
 from msdgs_train.settings import Checked, optional
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+WHITE = (1.0, 1.0, 1.0)
+BACKGROUNDS = {"white": WHITE, "black": (0.0, 0.0, 0.0)}
+CHOICES = ["auto", *BACKGROUNDS, "random"]
 
 
 @dataclass(frozen=True)
@@ -24,8 +27,10 @@ class DataConfig(Checked):
     'frame_(\\d+)'. The dataset's own times if not given; for COLMAP those of `times.json`, or else `names`."""
     masks: bool = True
     """Whether pixels that a dataset's masks hide (black in the mask) are left out of the loss and of evaluations."""
-    background: Literal["white", "black", "random"] = "white"
-    """Color behind the scene; random: another one each step, white in evaluation."""
+    background: Literal["auto", "white", "black", "random"] = "auto"
+    """Color behind the scene. auto: white behind images that are transparent somewhere, and behind opaque ones the
+    median color of their borders, which is that of a plain backdrop; random: another one each step, white in
+    evaluation."""
     scene_half_size: Annotated[float | None, optional("LENGTH")] = None
     """Half the side of the cube around its center that holds the scene, in the dataset's units; from points or cameras
     if not given."""
@@ -38,9 +43,10 @@ class DataConfig(Checked):
         self.require(("llffhold",), "0, or an integer of 3 or more", lambda v: type(v) is int and (v == 0 or v > 2))
         self.require(("time_from",), EXPECTED, is_time_from)
         self.require(("masks",), "true or false", lambda v: type(v) is bool)
-        self.require(("background",), f"one of {[*BACKGROUNDS, 'random']}", lambda v: v in {*BACKGROUNDS, "random"})
+        self.require(("background",), f"one of {CHOICES}", lambda v: v in CHOICES)
 
-    @property
-    def evaluation_background(self) -> tuple[float, float, float]:
-        """RGB in [0, 1] behind held-out images; stored in the model."""
-        return BACKGROUNDS.get(self.background, BACKGROUNDS["white"])
+    def evaluation_background(self, scene: SceneData) -> tuple[float, float, float]:
+        """RGB in [0, 1] behind held-out images of a scene; stored in the model."""
+        if self.background == "auto":
+            return scene.border_color or WHITE
+        return BACKGROUNDS.get(self.background, WHITE)

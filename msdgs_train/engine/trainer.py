@@ -64,6 +64,7 @@ class Trainer:
     def __init__(self, config: TrainConfig, scene: SceneData) -> None:
         torch.set_num_threads(config.run.threads if config.run.batch_size == 1 else 1)
         self.config, self.scene = config, scene
+        self._background = torch.tensor(config.data.evaluation_background(scene))
         self.schedule = Schedule.from_config(config)
         self.rollbacks = 0
         self._images, run = ImageCache(), config.run
@@ -130,7 +131,7 @@ class Trainer:
     @torch.no_grad()
     def evaluate(self, split: str) -> Iterator[EvaluatedFrame]:
         """Render each frame of a split and compute its metrics."""
-        background = torch.tensor(self.config.data.evaluation_background)
+        background = self._background
         on_device = background.to(self.config.run.device)
         for frame in self.scene.splits[split]:
             target = self._images.image(frame, background)
@@ -269,4 +270,4 @@ class Trainer:
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":
             return torch.rand(3, generator=self._generator)
-        return torch.tensor(self.config.data.evaluation_background)
+        return self._background

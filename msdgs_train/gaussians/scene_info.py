@@ -55,7 +55,7 @@ class SceneInfo:
         others = first_by_pose([*shown, *spread_frames(training, TRAINING_CAMERAS)], lambda frame: frame.camera)
         return cls(
             time_range=scene.time_range,
-            background=data.evaluation_background,
+            background=data.evaluation_background(scene),
             bounds=bounds,
             cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in shown],
             training_cameras=[SceneCamera(f.name, f.t, f.camera).to_plain() for f in others[len(shown) :]],

@@ -25,6 +25,8 @@ from msdgs_train.datasets.common.normalization import (
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 SPLITS = ("train", "val", "test")
+BORDER_IMAGES = 16
+"""Images whose borders are looked at."""
 HELD_OUT = 8
 """Every 8th frame is a test frame if a dataset names none, as in Mip-NeRF 360 and 3D Gaussian Splatting."""
 
@@ -117,6 +119,24 @@ class SceneData:
         """Those of all frames, of each pose one."""
         every = (frame.camera for frames in self.splits.values() for frame in frames)
         return list({camera.camera_to_world.tobytes(): camera for camera in every}.values())
+
+    @cached_property
+    def border_color(self) -> tuple[float, float, float] | None:
+        """Median of the pixels at the borders of some training images, RGB in [0, 1]; None if one of these is
+        transparent somewhere, or masks hide all borders."""
+        frames, borders = self.splits["train"], []
+        for index in sorted({round(k) for k in np.linspace(0, len(frames) - 1, BORDER_IMAGES)}):
+            rgba, counts = frames[index].load_rgba(), frames[index].load_mask()
+            if rgba[..., 3].min() < 255:
+                return None
+            counts = np.full(rgba.shape[:2], True) if counts is None else counts.copy()
+            counts[1:-1, 1:-1] = False
+            borders.append(rgba[counts, :3])
+        pixels = np.concatenate(borders)
+        if not len(pixels):
+            return None
+        red, green, blue = np.median(pixels, axis=0) / 255
+        return float(red), float(green), float(blue)
 
     def normalized(self) -> "SceneData":
         """The same scene in the frame that it is trained in, without points that fewer than half of the cameras see."""
