@@ -28,9 +28,8 @@ class DataConfig(Checked):
     masks: bool = True
     """Whether pixels that a dataset's masks hide (black in the mask) are left out of the loss and of evaluations."""
     background: Literal["auto", "white", "black", "random"] = "auto"
-    """Color behind the scene. auto: white behind images that are transparent somewhere, and behind opaque ones the
-    median color of their borders, which is that of a plain backdrop; random: another one each step, white in
-    evaluation."""
+    """Color behind the scene. auto: that of a plain backdrop, which most pixels at the borders of opaque images have,
+    else white; random: another one each step, white in evaluation."""
     scene_half_size: Annotated[float | None, optional("LENGTH")] = None
     """Half the side of the cube around its center that holds the scene, in the dataset's units; from points or cameras
     if not given."""
@@ -48,5 +47,5 @@ class DataConfig(Checked):
     def evaluation_background(self, scene: SceneData) -> tuple[float, float, float]:
         """RGB in [0, 1] behind held-out images of a scene; stored in the model."""
         if self.background == "auto":
-            return scene.border_color or WHITE
+            return scene.backdrop or WHITE
         return BACKGROUNDS.get(self.background, WHITE)

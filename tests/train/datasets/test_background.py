@@ -1,4 +1,4 @@
-"""The color behind a scene: white behind transparent images, else that of their borders."""
+"""The color behind a scene: that of a plain backdrop, else white."""
 
 import math
 from pathlib import Path
@@ -52,6 +52,13 @@ def test_it_is_white_behind_images_that_are_transparent_somewhere(tmp_path: Path
     assert behind(scene_of(tmp_path, images)) == tuple(value / 255 for value in BACKDROP)
     images[2][10, 10, 3] = 254
     assert behind(scene_of(tmp_path, images)) == WHITE
+
+
+@pytest.mark.parametrize(("step", "expected"), [(4, (90 / 255,) * 3), (5, WHITE)])
+def test_a_wall_that_varies_is_no_backdrop(tmp_path: Path, step: int, expected: tuple[float, float, float]):
+    columns = 90 + step * (np.arange(32) % 3 - 1)  # a third of the pixels each
+    image = np.broadcast_to(columns[None, :, None], (24, 32, 3)).astype(np.uint8)
+    assert behind(scene_of(tmp_path, [image, np.roll(image, 1, axis=1)])) == expected
 
 
 def test_hidden_pixels_do_not_count(tmp_path: Path):
