@@ -55,7 +55,8 @@ class FitProgress(Observer):
         self._signals.__exit__(*error)
 
     def on_train_start(self, trainer: Trainer) -> None:
-        self._print(summary(trainer.scene))
+        has_own = trainer.config.data.background == "auto"
+        self._print(summary(trainer.scene, trainer.scene.backdrop if has_own else None))
         for warning in trainer.scene.warnings:
             self._print(f"warning: {warning}", style="yellow")
         if isinstance(trainer.system, RaySystem):

@@ -9,6 +9,7 @@ import pytest
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.datasets.common.scene_data import Frame, SceneData
+from msdgs_train.datasets.common.summary import summary
 from msdgs_train.datasets.config import DataConfig
 
 WHITE = (1.0, 1.0, 1.0)
@@ -43,6 +44,7 @@ def behind(scene: SceneData, **settings: str) -> tuple[float, float, float]:
 def test_a_plain_backdrop_is_behind_the_scene(tmp_path: Path):
     scene = scene_of(tmp_path, [picture(BACKDROP, wall_from=30 - k) for k in range(4)])
     assert behind(scene) == tuple(value / 255 for value in BACKDROP)
+    assert summary(scene, scene.backdrop).endswith("no points, backdrop #5a4e46")
     assert behind(scene, background="white") == behind(scene, background="random") == WHITE
     assert behind(scene, background="black") == (0.0, 0.0, 0.0)
 
