@@ -167,7 +167,7 @@ def trained(config: TrainConfig, scene: SceneData) -> Trainer:
 
 def draw(trainer: Trainer, dynamic: EvaluatedModel, frame: Frame, moving: np.ndarray) -> Scores:
     """Score the trainer's model on a held-out frame, against the image that the dynamic model is scored against."""
-    background = torch.tensor(dynamic.loaded.scene.background)
+    background = torch.tensor(trainer.background)
     rgb = trainer.system.render(frame.camera, frame.t, background, trainer.step_count)
     target = dynamic.image(frame)
     return Scores(psnr(rgb, target), masked_psnr(rgb, target, moving))

@@ -55,8 +55,7 @@ class FitProgress(Observer):
         self._signals.__exit__(*error)
 
     def on_train_start(self, trainer: Trainer) -> None:
-        has_own = trainer.config.data.background == "auto"
-        self._print(summary(trainer.scene, trainer.scene.backdrop if has_own else None))
+        self._print(summary(trainer.scene, trainer.background))
         for warning in trainer.scene.warnings:
             self._print(f"warning: {warning}", style="yellow")
         if isinstance(trainer.system, RaySystem):

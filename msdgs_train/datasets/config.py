@@ -1,15 +1,16 @@
 """Settings of the data."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
+from msdgs_train.datasets.common.backdrop import Color
 from msdgs_train.datasets.common.scene_data import SceneData
 from msdgs_train.datasets.common.times import EXPECTED, is_time_from
 from msdgs_train.settings import Checked, optional
 
-WHITE = (1.0, 1.0, 1.0)
-BACKGROUNDS = {"white": WHITE, "black": (0.0, 0.0, 0.0)}
-CHOICES = ["auto", *BACKGROUNDS, "random"]
+Background = Literal["auto", "white", "black", "random"]
+
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,9 @@ class DataConfig(Checked):
     'frame_(\\d+)'. The dataset's own times if not given; for COLMAP those of `times.json`, or else `names`."""
     masks: bool = True
     """Whether pixels that a dataset's masks hide (black in the mask) are left out of the loss and of evaluations."""
-    background: Literal["auto", "white", "black", "random"] = "auto"
-    """Color behind the scene. auto: that of a plain backdrop, which most pixels at the borders of opaque images have,
-    else white; random: another one each step, white in evaluation."""
+    background: Background = "auto"
+    """Color behind the scene. auto: if most pixels at the borders of opaque images have one color, that color, else
+    white; random: another one each step, white in evaluation."""
     scene_half_size: Annotated[float | None, optional("LENGTH")] = None
     """Half the side of the cube around its center that holds the scene, in the dataset's units; from points or cameras
     if not given."""
@@ -42,10 +43,10 @@ class DataConfig(Checked):
         self.require(("llffhold",), "0, or an integer of 3 or more", lambda v: type(v) is int and (v == 0 or v > 2))
         self.require(("time_from",), EXPECTED, is_time_from)
         self.require(("masks",), "true or false", lambda v: type(v) is bool)
-        self.require(("background",), f"one of {CHOICES}", lambda v: v in CHOICES)
+        self.require(("background",), f"one of {[*get_args(Background)]}", lambda v: v in get_args(Background))
 
-    def evaluation_background(self, scene: SceneData) -> tuple[float, float, float]:
+    def evaluation_background(self, scene: SceneData) -> Color:
         """RGB in [0, 1] behind held-out images of a scene; stored in the model."""
         if self.background == "auto":
             return scene.backdrop or WHITE
-        return BACKGROUNDS.get(self.background, WHITE)
+        return BLACK if self.background == "black" else WHITE

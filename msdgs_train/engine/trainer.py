@@ -14,6 +14,7 @@ from torch.nn.utils import clip_grad_norm_
 from msdgs_serve.threads import sharing_cores
 from msdgs_train.datasets import Frame, SceneData
 from msdgs_train.datasets.cache import ImageCache
+from msdgs_train.datasets.common.backdrop import Color
 from msdgs_train.datasets.rays import RayBatch, RayBatches
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.curriculum import WindowCurriculum
@@ -64,7 +65,6 @@ class Trainer:
     def __init__(self, config: TrainConfig, scene: SceneData) -> None:
         torch.set_num_threads(config.run.threads if config.run.batch_size == 1 else 1)
         self.config, self.scene = config, scene
-        self._background = torch.tensor(config.data.evaluation_background(scene))
         self.schedule = Schedule.from_config(config)
         self.rollbacks = 0
         self._images, run = ImageCache(), config.run
@@ -76,6 +76,11 @@ class Trainer:
         if isinstance(self.system, RaySystem):
             training, size = scene.splits["train"], self.system.rays_per_batch
             self._rays = RayBatches(training, size, config.run.device, self.system.hits)
+
+    @functools.cached_property
+    def background(self) -> Color:
+        """RGB in [0, 1] behind held-out images; found in images when it is first asked for."""
+        return self.config.data.evaluation_background(self.scene)
 
     def _reset(self) -> None:
         """The state before the first step."""
@@ -131,7 +136,7 @@ class Trainer:
     @torch.no_grad()
     def evaluate(self, split: str) -> Iterator[EvaluatedFrame]:
         """Render each frame of a split and compute its metrics."""
-        background = self._background
+        background = torch.tensor(self.background)
         on_device = background.to(self.config.run.device)
         for frame in self.scene.splits[split]:
             target = self._images.image(frame, background)
@@ -270,4 +275,4 @@ class Trainer:
     def _next_background(self) -> Tensor:
         if self.config.data.background == "random":
             return torch.rand(3, generator=self._generator)
-        return self._background
+        return torch.tensor(self.background)

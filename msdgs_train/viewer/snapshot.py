@@ -55,8 +55,7 @@ def snapshot_of_training(trainer: Trainer) -> Snapshot:
         raise InvalidInput("viewer", "off for this system, which isn't made of Gaussians", trainer.config.run.system)
     schedule, model = trainer.schedule, copy.deepcopy(system.eval_model).cpu()
     model.config = replace(model.config, eps2d=schedule.eps2d(step))
-    background = trainer.config.data.evaluation_background(trainer.scene)
-    return Snapshot(model, background, schedule.deforms(step), schedule.sh_degree(step))
+    return Snapshot(model, trainer.background, schedule.deforms(step), schedule.sh_degree(step))
 
 
 def _image_of(rendering: Rendering, channel: Channel) -> np.ndarray:

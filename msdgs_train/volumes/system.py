@@ -25,6 +25,7 @@ from msdgs_train.volumes.model_file import render, save_volume
 
 BASE = TrainConfig().updated(
     model=ModelConfig(layers=(), embedding_dim=0),
+    background="white",
     static_fraction=0.0,
     window_full_fraction=0.0,
     adam_beta2=0.99,

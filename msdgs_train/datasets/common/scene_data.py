@@ -9,6 +9,7 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.similarity import IDENTITY, Similarity
+from msdgs_train.datasets.common.backdrop import Color, find_backdrop
 from msdgs_train.datasets.common.distortion import Distortion, undistort
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import read_rgba, resize_area
@@ -25,11 +26,6 @@ from msdgs_train.datasets.common.normalization import (
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 SPLITS = ("train", "val", "test")
-BORDER_IMAGES = 16
-"""Images whose borders are looked at for a backdrop."""
-EQUAL_COLORS = 4
-"""Of 255, between a backdrop and pixels that show it. Real walls and curtains vary more, and have to be modeled: where
-they are the background, 35 % of a real video's pixels have an alpha below 0.9."""
 HELD_OUT = 8
 """Every 8th frame is a test frame if a dataset names none, as in Mip-NeRF 360 and 3D Gaussian Splatting."""
 
@@ -124,23 +120,9 @@ class SceneData:
         return list({camera.camera_to_world.tobytes(): camera for camera in every}.values())
 
     @cached_property
-    def backdrop(self) -> tuple[float, float, float] | None:
-        """The one color, RGB in [0, 1], of most pixels at the borders of some training images; None if there is none,
-        or if an image is transparent somewhere."""
-        frames, borders = self.splits["train"], []
-        for index in sorted({round(k) for k in np.linspace(0, len(frames) - 1, BORDER_IMAGES)}):
-            rgba, counts = frames[index].load_rgba(), frames[index].load_mask()
-            if rgba[..., 3].min() < 255:
-                return None
-            counts = np.full(rgba.shape[:2], True) if counts is None else counts.copy()
-            counts[1:-1, 1:-1] = False
-            borders.append(rgba[counts, :3])
-        pixels = np.concatenate(borders).astype(float)
-        color = np.median(pixels, axis=0) if len(pixels) else np.zeros(3)
-        if 2 * np.count_nonzero(np.abs(pixels - color).max(axis=1, initial=0) <= EQUAL_COLORS) <= len(pixels):
-            return None
-        red, green, blue = (color / 255).tolist()
-        return red, green, blue
+    def backdrop(self) -> Color | None:
+        """The color that opaque images show around the scene, RGB in [0, 1], if they show one."""
+        return find_backdrop(self.splits["train"])
 
     def normalized(self) -> "SceneData":
         """The same scene in the frame that it is trained in, without points that fewer than half of the cameras see."""

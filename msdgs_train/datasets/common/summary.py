@@ -1,11 +1,12 @@
 """One line on what was read of a dataset."""
 
+from msdgs_train.datasets.common.backdrop import Color
 from msdgs_train.datasets.common.scene_data import SceneData
 
 
-def summary(scene: SceneData, backdrop: tuple[float, float, float] | None = None) -> str:
-    """Layout, images, cameras, times, points and normalization of a scene, such as a user would check them; and the
-    color behind it, RGB in [0, 1], if it is that of the images' backdrop."""
+def summary(scene: SceneData, background: Color) -> str:
+    """Layout, images, cameras, times, points and normalization of a scene, such as a user would check them, and the
+    color behind it."""
     frames = [frame for frames in scene.splits.values() for frame in frames]
     counts = (f"{len(each):,} {split}" for split, each in scene.splits.items() if each)
     sizes = sorted({(frame.camera.width, frame.camera.height) for frame in frames})
@@ -23,8 +24,7 @@ def summary(scene: SceneData, backdrop: tuple[float, float, float] | None = None
     ]
     if masked := sum(frame.mask_path is not None for frame in frames):
         parts.append(f"masks of {'all' if masked == len(frames) else f'{masked:,}'} images")
-    if backdrop:
-        parts.append("backdrop #" + "".join(f"{round(255 * value):02x}" for value in backdrop))
+    parts.append("background #" + "".join(f"{round(255 * value):02x}" for value in background))
     if not place.is_identity:
         x, y, z = place.offset
         parts.append(f"trained at {1 / place.scale:.3g} times its size around ({x:.10g}, {y:.10g}, {z:.10g})")

@@ -179,8 +179,8 @@ def test_cameras_at_one_place_are_named(place: Similarity):
 
 def test_one_line_says_what_was_read():
     scene = placed(SCENES["around, points"], PLACES["everything"]).normalized()
-    assert summary(scene) == (
-        "D-NeRF layout, 12 train images, 40×30, 12 camera poses, 12 times from 0 to 0.916667, 300 points, trained at "
-        "0.027 times its size around (-4000, 20, 9000)"
+    assert summary(scene, (1.0, 0.5, 0.0)) == (
+        "D-NeRF layout, 12 train images, 40×30, 12 camera poses, 12 times from 0 to 0.916667, 300 points, "
+        "background #ff8000, trained at 0.027 times its size around (-4000, 20, 9000)"
     )
-    assert summary(SCENES["outwards"]).endswith("no points")
+    assert summary(SCENES["outwards"], (1.0, 1.0, 1.0)).endswith("no points, background #ffffff")
