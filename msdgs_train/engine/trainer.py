@@ -77,9 +77,9 @@ class Trainer:
             training, size = scene.splits["train"], self.system.rays_per_batch
             self._rays = RayBatches(training, size, config.run.device, self.system.hits)
 
-    @functools.cached_property
+    @property
     def background(self) -> Color:
-        """RGB in [0, 1] behind held-out images; found in images when it is first asked for."""
+        """RGB in [0, 1] behind held-out images."""
         return self.config.data.evaluation_background(self.scene)
 
     def _reset(self) -> None:

@@ -10,8 +10,8 @@ Color = tuple[float, float, float]
 IMAGES = 8
 """Images that are looked at: each may be in a video of its own, which is decoded for it."""
 TOLERANCE = 4
-"""Of 255, between the backdrop and pixels that show it. Real walls vary more, and need Gaussians: over the median color
-of any border, 35 % of the pixels of a real video had an alpha below 0.9."""
+"""Of 255, between the backdrop and pixels that show it. Real walls vary more, and need Gaussians: as background they
+would be missing in depth and alpha."""
 
 
 class Image(Protocol):
@@ -24,7 +24,7 @@ class Image(Protocol):
 def find_backdrop(frames: Sequence[Image]) -> Color | None:
     """Return the color, RGB in [0, 1], that more than half of the pixels at the borders of some of the frames have;
     None if there is none, if masks hide half of these pixels, or if an image is transparent somewhere."""
-    shown, pixels = [np.empty((0, 3), np.uint8)], 0
+    shown, pixels = [], 0
     for index in sorted({round(k) for k in np.linspace(0, len(frames) - 1, IMAGES)}):
         rgba = frames[index].load_rgba()
         if rgba[..., 3].min() < 255:
