@@ -12,6 +12,8 @@ from msdgs_serve.writing import writing
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
+HALF = 0.5 + 1e-9
+"""Added before rounding down, so that halves go up whatever the error of the division before."""
 
 
 class ImageSize(NamedTuple):
@@ -67,12 +69,9 @@ def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:
     """
     if rgba.shape[:2] == (height, width):
         return rgba
-    means = rgba.astype(np.float64)
-    means[..., :3] *= means[..., 3:]
-    means = _cell_means(_cell_means(means, height).swapaxes(0, 1), width).swapaxes(0, 1)
-    alpha = means[..., 3:]
-    means[..., :3] /= np.where(alpha > 0, alpha, 1)
-    return np.floor(means + 0.5).astype(np.uint8)
+    means = np.empty((height, width, 4), np.uint8)
+    _area_means(np.ascontiguousarray(rgba), means)
+    return means
 
 
 def composite(rgba: np.ndarray, background: np.ndarray | tuple[float, float, float]) -> np.ndarray:
@@ -107,18 +106,34 @@ def _composite(rgba: np.ndarray, background: np.ndarray, rgb: np.ndarray) -> Non
             rgb[pixel, channel] = behind + alpha * (unit * np.float32(rgba[pixel, channel]) - behind)
 
 
-def _cell_means(rows: np.ndarray, count: int) -> np.ndarray:
-    """Average float64 [length, …] over `count` equal cells, [count, …]; cell borders may split rows.
-
-    Computed as differences of cumulative sums, at a cost that doesn't depend on the cell size.
-    """
-    length = len(rows)
-    sums = np.zeros((length + 1, *rows.shape[1:]))
-    np.cumsum(rows, axis=0, out=sums[1:])
-    edges = np.arange(count + 1) * (length / count)
-    below = np.minimum(edges.astype(np.int64), length - 1)
-    cut = (edges - below).reshape(-1, *[1] * (rows.ndim - 1)) * rows[below]
-    return np.diff(sums[below] + cut, axis=0) * (count / length)
+@kernel
+def _area_means(rgba: np.ndarray, means: np.ndarray) -> None:
+    """Write [height, width, 4]; with NumPy's cumulative sums 20 to 60 times as long and in 20 times the memory."""
+    (old_height, old_width, _), (height, width, _) = rgba.shape, means.shape
+    columns = np.empty((old_width, 4))  # colors times alpha, and alpha, over the rows of a new pixel
+    for row in range(height):
+        top, bottom = row * old_height / height, (row + 1) * old_height / height
+        columns[:] = 0
+        for y in range(int(top), min(int(np.ceil(bottom)), old_height)):
+            part = min(bottom, y + 1.0) - max(top, float(y))
+            for x in range(np.uint64(old_width)):
+                alpha = part * rgba[y, x, 3]
+                for channel in range(3):
+                    columns[x, channel] += alpha * rgba[y, x, channel]
+                columns[x, 3] += alpha
+        for column in range(width):
+            left, right = column * old_width / width, (column + 1) * old_width / width
+            red = green = blue = alpha = 0.0
+            for x in range(int(left), min(int(np.ceil(right)), old_width)):
+                part = min(right, x + 1.0) - max(left, float(x))
+                red, green = red + part * columns[x, 0], green + part * columns[x, 1]
+                blue, alpha = blue + part * columns[x, 2], alpha + part * columns[x, 3]
+            of_colors = 1 / alpha if alpha > 0 else 0.0
+            area = (bottom - top) * (right - left)
+            means[row, column, 0] = int(red * of_colors + HALF)
+            means[row, column, 1] = int(green * of_colors + HALF)
+            means[row, column, 2] = int(blue * of_colors + HALF)
+            means[row, column, 3] = int(alpha / area + HALF)
 
 
 def _open(path: Path) -> "oiio.ImageInput":  # quoted, or OpenImageIO's bindings report leaks after `--help`

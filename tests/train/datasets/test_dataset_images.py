@@ -41,6 +41,15 @@ def test_reduction_is_the_mean_over_the_covered_area(width: int, height: int):
     assert_close(resize_area(rgba, width, height), area_mean_by_loops(rgba, width, height), "rounded_to_8bit")
 
 
+@pytest.mark.parametrize("alpha", [255, 3])
+def test_halves_are_rounded_up(alpha: int):
+    lower = np.arange(255, dtype=np.uint8)[None, :, None].repeat(4, axis=2)
+    lower[..., 3] = alpha
+    upper = lower + np.array([1, 1, 1, 0], np.uint8)
+    reduced = resize_area(np.tile(np.concatenate([lower, upper]), (3, 1, 1)), 255, 3)
+    assert (reduced == upper).all()
+
+
 def test_the_same_size_changes_nothing():
     rgba = image(0, 12, 8)
     rgba[:3, :5, 3] = 0
