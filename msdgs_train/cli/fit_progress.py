@@ -1,6 +1,7 @@
 """Terminal output of `msdgs-train fit`: phases, a progress bar, metrics, and Ctrl-C as a clean stop."""
 
 import contextlib
+import math
 import shlex
 import threading
 import time
@@ -22,6 +23,10 @@ from msdgs_train.systems.base import RaySystem
 
 UPDATE_SECONDS = 0.5
 PLAIN_LINE_SECONDS = 10.0  # between lines if the output is not a terminal
+NOT_ALL_KEPT = (
+    "warning: decoded training images take {needed:.1f} GiB, of which {kept:g} stay in memory. The others are read and "
+    "downscaled again whenever they are drawn: --image-memory {all} keeps all, and a smaller --size needs less"
+)
 
 
 class FitProgress(Observer):
@@ -58,6 +63,9 @@ class FitProgress(Observer):
         self._print(summary(trainer.scene, trainer.background))
         for warning in trainer.scene.warnings:
             self._print(f"warning: {warning}", style="yellow")
+        kept, needed = trainer.config.run.image_memory, trainer.bytes_of_images / 2**30
+        if needed > kept and not isinstance(trainer.system, RaySystem):
+            self._print(NOT_ALL_KEPT.format(needed=needed, kept=kept, all=math.ceil(needed)), style="yellow")
         if isinstance(trainer.system, RaySystem):
             self.elements, phases = "vertices", []
         else:

@@ -1,6 +1,6 @@
 """A cache of decoded images and masks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import cast
 
@@ -11,12 +11,15 @@ from torch import Tensor
 from msdgs_train.datasets import Frame, composite
 
 MAX_BYTES = 2 << 30
+CHANNELS = 4
 
 
 class ImageCache:
-    """Keeps decoded images as uint8 RGBA, and masks as bool, up to `MAX_BYTES`."""
+    """Keeps decoded images as uint8 RGBA, and masks as bool, up to `max_bytes`; others are read whenever they are asked
+    for."""
 
-    def __init__(self) -> None:
+    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+        self._max_bytes = max_bytes
         self._pixels: dict[tuple[Path, int, bool], np.ndarray] = {}
         self._bytes = 0
 
@@ -49,7 +52,14 @@ class ImageCache:
         pixels = self._pixels.get(key)
         if pixels is None:
             pixels = read()
-            if self._bytes + pixels.nbytes <= MAX_BYTES:
+            if self._bytes + pixels.nbytes <= self._max_bytes:
                 self._pixels[key] = pixels
                 self._bytes += pixels.nbytes
         return pixels
+
+
+def bytes_of(frames: Iterable[Frame]) -> int:
+    """What images and masks of these frames take once they are decoded."""
+    return sum(
+        frame.camera.width * frame.camera.height * (CHANNELS + (frame.mask_path is not None)) for frame in frames
+    )

@@ -40,6 +40,8 @@ class RunConfig(Checked):
     their bits don't depend on it."""
     device: Literal["cpu", "cuda"] = "cpu"
     """cuda: all of a step is on the GPU, rendered by gsplat (msdgs[cuda]); the bits differ from run to run."""
+    image_memory: float = 2.0
+    """GiB of decoded images that stay in memory, as 8-bit RGBA; others are read again whenever they are drawn."""
     gpu_precision: Precision = "float32"
     """cuda: of the matrix products of MLP trunks in training; encodings, heads and evaluations are in float32."""
     gpu_image_memory: float = 8.0
@@ -58,7 +60,7 @@ class RunConfig(Checked):
         self.require(("time",), "wall or cpu", lambda v: v in ("wall", "cpu"))
         self.require(("device",), "cpu or cuda", lambda v: v in ("cpu", "cuda"))
         self.require(("gpu_precision",), "float32, tf32 or bf16", lambda v: v in get_args(Precision))
-        self.require_weights("gpu_image_memory")
+        self.require_weights("image_memory", "gpu_image_memory")
 
 
 @dataclass(frozen=True)
@@ -206,8 +208,8 @@ def _own_type(system: Any) -> type[SystemConfig]:
 
 
 RESUMABLE_CHANGES = frozenset({
-    "steps", "threads", "device", "gpu_precision", "gpu_image_memory", "minutes", "log_every", "eval_every",
-    "checkpoint_every",
+    "steps", "threads", "device", "gpu_precision", "image_memory", "gpu_image_memory", "minutes", "log_every",
+    "eval_every", "checkpoint_every",
 })  # fmt: skip
 """Settings that may change when a run is resumed. All others have affected the model already."""
 

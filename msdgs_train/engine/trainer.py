@@ -13,7 +13,7 @@ from torch.nn.utils import clip_grad_norm_
 
 from msdgs_serve.threads import sharing_cores
 from msdgs_train.datasets import Frame, SceneData
-from msdgs_train.datasets.cache import ImageCache
+from msdgs_train.datasets.cache import ImageCache, bytes_of
 from msdgs_train.datasets.common.backdrop import Color
 from msdgs_train.datasets.rays import RayBatch, RayBatches
 from msdgs_train.engine.config import TrainConfig
@@ -67,7 +67,8 @@ class Trainer:
         self.config, self.scene = config, scene
         self.schedule = Schedule.from_config(config)
         self.rollbacks = 0
-        self._images, run = ImageCache(), config.run
+        run = config.run
+        self._images = ImageCache(round(run.image_memory * 2**30))
         self._is_on_host = arrays.has_kernels(torch.empty(0, device=run.device))
         resident = 0 if self._is_on_host else round(run.gpu_image_memory * 2**30)
         self._training_images = TrainingImages(self._images, run.device, resident)
@@ -225,6 +226,13 @@ class Trainer:
         """Images that take about as long to evaluate as a step takes."""
         size = self.config.run.batch_size
         return size if self._rays is None else RENDERED_PER_STEP * size * self._rays.images_per_batch
+
+    @property
+    def bytes_of_images(self) -> int:
+        """What all training images take in memory; their halves, too, if some are still drawn at half the size."""
+        frames = self.scene.splits["train"]
+        halves = (frame.halved() for frame in frames if self.schedule.halves(frame.camera.width, self.step_count))
+        return bytes_of(frames) + bytes_of(halves)
 
     def _generators(self) -> list[torch.Generator]:
         return [self._generator, *self.system.generators()]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from msdgs_train.datasets import Frame, load_scene
-from msdgs_train.datasets import cache as cache_module
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.datasets.common.images import resize_area
 from msdgs_train.engine import schedule as schedule_module
@@ -56,10 +55,23 @@ def test_the_cache_keeps_no_more_bytes_than_its_limit(data: Path, monkeypatch: p
     one, other = load_scene(data).splits["train"][:2]
     read, load = [], Frame.load_rgba
     monkeypatch.setattr(Frame, "load_rgba", lambda frame: read.append(frame.name) or load(frame))
-    monkeypatch.setattr(cache_module, "MAX_BYTES", 5 * SIZE * SIZE)  # one image and its half
-    cache = ImageCache()
+    cache = ImageCache(5 * SIZE * SIZE)  # one image and its half
     for _ in range(2):
         cache.half_rgba(one)
         cache.rgba(one)
         cache.rgba(other)
     assert read == [one.name, other.name, other.name]
+
+
+def test_images_that_are_not_kept_give_the_same_steps(data: Path) -> None:
+    scene = load_scene(data)
+    kept, read_again = (Trainer(small_config(steps=STEPS, image_memory=memory), scene) for memory in (1.0, 0.0))
+    assert [kept.step().loss for _ in range(STEPS)] == [read_again.step().loss for _ in range(STEPS)]
+
+
+@pytest.mark.parametrize(("halved", "of_one"), [(0.0, 4 * SIZE**2), (0.5, 5 * SIZE**2)])
+def test_images_take_so_many_bytes(halved: float, of_one: int, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(schedule_module, "HALVED_WIDTH", SIZE)
+    scene = load_scene(data)
+    trainer = Trainer(small_config(steps=STEPS, half_resolution_fraction=halved), scene)
+    assert trainer.bytes_of_images == of_one * len(scene.splits["train"])

@@ -176,6 +176,15 @@ def test_training_goes_on_if_its_output_is_not_read(
         assert fit(config, data, tmp_path / "run", observer=progress).status == "finished"
 
 
+def test_images_that_memory_has_no_room_for_are_named(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number, (memory, is_named) in enumerate((("0", True), ("1", False))):
+        run = ["fit", str(data), str(tmp_path / str(number)), "--steps=1", f"--image-memory={memory}", *SMALL]
+        assert cli.main(run) == 0
+        assert ("--image-memory 1 keeps all" in capsys.readouterr().out) == is_named
+
+
 def test_synthetic_makes_what_fit_reads(tmp_path: Path) -> None:
     data = tmp_path / "toy"
     assert cli.main(["synthetic", str(data), "--size", "16", "--train-frames", "3", "--test-frames", "1"]) == 0
