@@ -123,8 +123,7 @@ class CanonicalGaussians(nn.Module):
         points = 2 * torch.rand(count * (1 if in_view is None else MAX_DRAWS), 3, generator=generator) - 1
         points = points * scene_half_size
         if in_view is not None:
-            found = points[torch.from_numpy(in_view(points.numpy()))]
-            points = (found if len(found) >= count else points)[:count]
+            points = _first_in_view(points, count, in_view)
         colors = torch.rand(count, 3, generator=generator) if gray is None else torch.full((count, 3), gray)
         return cls.from_points(points, colors, sh_degree, generator, attributes)
 
@@ -146,6 +145,16 @@ class CanonicalGaussians(nn.Module):
         known = random if colors is None else torch.from_numpy(colors).float()[chosen]
         means = torch.from_numpy(points).float()[chosen]
         return cls.from_points(means, known, sh_degree, generator, attributes)
+
+
+def _first_in_view(points: Tensor, count: int, in_view: Callable[[np.ndarray], np.ndarray]) -> Tensor:
+    """The first `count` that are in view, looked for in parts; the first of all if there are fewer."""
+    found = points[:0]
+    for part in points.split(count):
+        found = torch.cat([found, part[torch.from_numpy(in_view(part.numpy()))]])
+        if len(found) >= count:
+            return found[:count]
+    return points[:count]
 
 
 def neighbor_distances(points: Tensor) -> Tensor:
