@@ -18,7 +18,7 @@ class ImageCache:
     """Keeps decoded images as uint8 RGBA, and masks as bool, up to `max_bytes`; others are read whenever they are asked
     for."""
 
-    def __init__(self, max_bytes: int = MAX_BYTES) -> None:
+    def __init__(self, max_bytes: float = MAX_BYTES) -> None:
         self._max_bytes = max_bytes
         self._pixels: dict[tuple[Path, int, bool], np.ndarray] = {}
         self._bytes = 0

@@ -68,9 +68,9 @@ class Trainer:
         self.schedule = Schedule.from_config(config)
         self.rollbacks = 0
         run = config.run
-        self._images = ImageCache(round(run.image_memory * 2**30))
+        self._images = ImageCache(run.image_memory * 2**30)
         self._is_on_host = arrays.has_kernels(torch.empty(0, device=run.device))
-        resident = 0 if self._is_on_host else round(run.gpu_image_memory * 2**30)
+        resident = 0 if self._is_on_host else run.gpu_image_memory * 2**30
         self._training_images = TrainingImages(self._images, run.device, resident)
         self._reset()
         self._rays = None

@@ -47,7 +47,7 @@ class TrainingImages:
     """The images of a run. Up to `max_bytes` of them stay on its device, others are copied there whenever they are
     drawn, without waiting for it; 0 on a CPU, where the cache of decoded images has them."""
 
-    def __init__(self, decoded: ImageCache, device: str, max_bytes: int) -> None:
+    def __init__(self, decoded: ImageCache, device: str, max_bytes: float) -> None:
         self._decoded, self._device, self._free = decoded, device, max_bytes
         self._facts: dict[tuple[Path, int], ImageFacts] = {}
         self._resident: dict[tuple[Path, int], TrainingImage] = {}
