@@ -146,8 +146,10 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_spac
     bounded = graph.node("Clip", [log_scales, *limits], "log_scales.bounded")
     canonical = graph.node("Exp", [bounded], output if deltas is None else "ids.scales")
     if deltas is not None:
+        signed = graph.node("Add", [canonical, deltas], "scales.signed")
+        minus = graph.node("Mul", [signed, graph.constant("scales.minus", np.array(-1, np.float32))], "scales.negated")
         least = graph.constant("scales.min", np.array(MIN_SCALE, np.float32))
-        graph.node("Max", [graph.node("Add", [canonical, deltas], "scales.moved"), least], output)
+        graph.node("Max", [graph.node("Max", [signed, minus], "scales.absolute"), least], output)
 
 
 def prefix(baked: Baked, count: int) -> onnx.ModelProto:

@@ -22,14 +22,13 @@ class Observed(NamedTuple):
 
     losses: Sequence[Tensor]
     squared_errors: Sequence[Tensor]
-    clamped_scales: Sequence[Tensor | int]
 
 
 class StepMeter:
     """Reads the results of each step at once, on a CPU."""
 
     def __init__(self) -> None:
-        self.skipped = self.skipped_in_a_row = self.clamped_scales = 0
+        self.skipped = self.skipped_in_a_row = 0
         self.averages: tuple[float, float] | None = None  # loss, squared error
 
     def accept(
@@ -38,7 +37,6 @@ class StepMeter:
         """Whether the optimizer takes a step along these gradients: not if they or the loss aren't finite. Raises
         `TrainingDiverged` after many such steps."""
         losses = [loss.item() for loss in observed.losses]
-        self.clamped_scales = max(map(int, observed.clamped_scales))
         loss = sum(losses) / len(losses)
         if not bool(torch.isfinite(loss + get_total_norm(gradients, foreach=True))):
             self.skipped += 1
@@ -79,22 +77,21 @@ class DeviceMeter(StepMeter):
         self, step: int, observed: Observed, gradients: Sequence[Tensor], optimizer: torch.optim.Optimizer
     ) -> bool:
         """True: fused Adam itself leaves parameters and moments as they are where `found_inf` is 1."""
-        new = torch.stack([torch.stack(tuple(values)).mean() for values in observed[:2]])
+        new = torch.stack([torch.stack(tuple(values)).mean() for values in observed])
         broken = ~torch.isfinite(new[0] + get_total_norm(gradients, foreach=True))
         optimizer.found_inf = broken.float()  # type: ignore[attr-defined]
-        skipped, in_a_row, _ = self._counts.unbind()
-        clamped = [torch.full_like(skipped, n) if isinstance(n, int) else n for n in observed.clamped_scales]
-        self._counts = torch.stack([skipped + broken, (in_a_row + 1) * broken, torch.stack(clamped).amax()])
+        skipped, in_a_row = self._counts.unbind()
+        self._counts = torch.stack([skipped + broken, (in_a_row + 1) * broken])
         smoothed = torch.where(self._means.isnan(), new, torch.lerp(new, self._means, SMOOTHING))
         self._means = torch.where(broken, self._means, smoothed)
         return True
 
     def read(self) -> None:
-        self.skipped, self.skipped_in_a_row, self.clamped_scales = map(int, self._counts.tolist())
+        self.skipped, self.skipped_in_a_row = map(int, self._counts.tolist())
         loss, error = self._means.tolist()
         self.averages = None if loss != loss else (loss, error)  # NaN before the first
 
     def load(self, skipped: int, in_a_row: int, averages: tuple[float, float] | None) -> None:
         super().load(skipped, in_a_row, averages)
-        self._counts = torch.tensor([skipped, in_a_row, 0], device=self._device)
+        self._counts = torch.tensor([skipped, in_a_row], device=self._device)
         self._means = torch.tensor(averages or (torch.nan, torch.nan), device=self._device)

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from torch.utils.tensorboard import SummaryWriter
 
 FOLDER = "tensorboard"
-TRAIN_SCALARS = ("loss", "psnr", "gaussians", "skipped", "clamped_scales", "seconds")
+TRAIN_SCALARS = ("loss", "psnr", "gaussians", "skipped", "seconds")
 EVAL_SCALARS = ("psnr", "ssim")
 
 

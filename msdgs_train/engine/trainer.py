@@ -40,14 +40,13 @@ RENDERED_PER_STEP = 3.0  # times that its rays are rendered while a step on rays
 
 
 class StepResult(NamedTuple):
-    """Metrics after one step; on a GPU, loss to clamped scales are those of the last step that was read."""
+    """Metrics after one step; on a GPU, loss to skipped steps are those of the last step that was read."""
 
     step: int  # of the schedule, counted from 1
     loss: float  # moving average
     psnr: float  # dB, on training images, of the moving average of squared errors
     gaussians: int
     skipped: int  # steps of the whole run whose loss or gradient was not finite
-    clamped_scales: int  # Gaussians with a scale of 0 or below in this step, which was set to e^-20
 
 
 class EvaluatedFrame(NamedTuple):
@@ -107,11 +106,7 @@ class Trainer:
         self.reached = range(self.step_count + 1, self.step_count + advance + 1)
         self.step_count += advance
         self.optimizer_steps += 1
-        observed = Observed(
-            [view.loss for view in views],
-            [view.squared_error for view in views],
-            [view.view.clamped_scales for view in views],
-        )
+        observed = Observed([view.loss for view in views], [view.squared_error for view in views])
         gradients = [p.grad for g in groups for p in g.params if p.grad is not None]
         is_accepted = self._meter.accept(self.step_count, observed, gradients, self.optimizer)
         if is_accepted:
@@ -130,9 +125,7 @@ class Trainer:
             meter.read()
             meter.check(self.step_count)
         loss, error = meter.averages or (float("nan"), float("nan"))
-        return StepResult(
-            self.step_count, loss, psnr_from_mse(error), self.system.size, meter.skipped, meter.clamped_scales
-        )
+        return StepResult(self.step_count, loss, psnr_from_mse(error), self.system.size, meter.skipped)
 
     @torch.no_grad()
     def evaluate(self, split: str) -> Iterator[EvaluatedFrame]:

@@ -13,7 +13,7 @@ LOG_SCALE_LIMIT = 20.0
 NaN."""
 
 MIN_SCALE = math.exp(-LOG_SCALE_LIMIT)
-"""Lower bound of scales in linear space, where deltas can make them negative; far below a pixel."""
+"""Lower bound of scales in linear space; far below a pixel."""
 
 
 def activated_scales(log_scales: Tensor) -> Tensor:
@@ -23,12 +23,11 @@ def activated_scales(log_scales: Tensor) -> Tensor:
 
 
 def add_to_scales(space: ScaleSpace, log_scales: Tensor, deltas: Tensor) -> Tensor:
-    """Deformed standard deviations, [N, 3]; `deltas` are of logarithms or of scales."""
+    """Deformed standard deviations, [N, 3]; `deltas` are of logarithms or of scales.
+
+    Scales that deltas make negative count by their absolute value: covariances have their squares, and so has the
+    rasterizer of 3D Gaussian Splatting. With a bound of 0 they would stay there, as they would have no gradient.
+    """
     if space == "log":
         return activated_scales(log_scales + deltas)
-    return (activated_scales(log_scales) + deltas).clamp_min(MIN_SCALE)
-
-
-def count_clamped(space: ScaleSpace, scales: Tensor) -> Tensor | int:
-    """Number of Gaussians with a scale that was clamped because it was 0 or below; on the device of the scales."""
-    return 0 if space == "log" else (scales <= MIN_SCALE).any(dim=1).sum()
+    return (activated_scales(log_scales) + deltas).abs().clamp_min(MIN_SCALE)

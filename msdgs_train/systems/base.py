@@ -25,7 +25,6 @@ class ViewLoss(NamedTuple):
 
     loss: Tensor  # scalar
     rgb: Tensor  # [H, W, 3] or [R, 3]
-    clamped_scales: Tensor | int = 0  # Gaussians a scale of which was clamped
     screen: Any = None  # results of the backward pass for `after_step`
     shows_all: bool = False  # nothing of the scene is outside the image
 

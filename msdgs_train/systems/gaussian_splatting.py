@@ -21,7 +21,6 @@ from msdgs_train.gaussians.bounds import first_by_pose, scene_bounds, scene_scal
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians, canonical_points
-from msdgs_train.gaussians.scale_space import count_clamped
 from msdgs_train.gaussians.scene_info import SceneInfo
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import SceneBounds
@@ -137,11 +136,10 @@ class GaussianSplatting:
         loss = loss + self._regularizers(posed, motions, points, t, moment)
         if c.alpha_weight:
             loss = loss + c.alpha_weight * target.alpha_error(alpha)
-        clamped = count_clamped(self.config.model.scale_space, posed.scales)
         shows_all = (
             target.facts.shows_all and not self.config.model.opacity_head
         )  # else opacity 0 at this time hides some
-        return ViewLoss(loss, rgb, clamped, info, shows_all)
+        return ViewLoss(loss, rgb, info, shows_all)
 
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
         for frame, view in views:

@@ -97,7 +97,7 @@ def test_bounds_that_hold_a_gaussian_back_are_counted():
         model.gaussians.log_scales[:2] = 30.0
         model.gaussians.raw_quats[0] = 0
         model.get_parameter("modulation.output.bias").fill_(50.0)
-        model.get_parameter("deformation.layers.0.heads.bias")[3:6] = -100.0
+        model.get_parameter("deformation.layers.0.heads.bias")[3:6] = -1e9
     limits = assess(model, SCENE, times=2).limits
     assert limits["canonical scales at e^±20"] == 2
     assert limits["quaternions without a direction"] == 1

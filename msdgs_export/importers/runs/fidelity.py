@@ -1,7 +1,7 @@
 """Properties of a run that a scene file can't hold, and the PSNR that this costs.
 
 The rasterizer of Deformable-3D-Gaussians doesn't normalize quaternions: if the norm isn't 1, the matrix is no rotation
-and shears the Gaussian, and the sign of a scale is lost in its square. The result is still an ellipsoid.
+and shears the Gaussian. The result is still an ellipsoid.
 """
 
 import numpy as np
@@ -35,7 +35,7 @@ def quaternion_fidelity(model: DynamicGaussians, info: SceneInfo) -> Loss:
         f"the run's renderer uses quaternions of any norm (largest difference from 1: {largest:.3g}), a scene file "
         f"unit ones: frames are {np.mean(psnrs):.1f} dB from the run's, the worst of {FRAMES} {min(psnrs):.1f} dB"
     )
-    what = "lengths of quaternions, which shear shapes, and signs of scales"
+    what = "lengths of quaternions, which shear shapes"
     return Loss("quaternion_fidelity", what, len(model.gaussians), min(psnrs), note)
 
 

@@ -273,7 +273,7 @@ def test_a_disk_that_is_full_from_the_start_is_named(data: Path, tmp_path: Path,
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # raised again by `flush`
 def test_so_are_the_plot_and_the_events(tmp_path: Path):
     others = set(threading.enumerate())
-    log, line = MetricsLog(tmp_path, tensorboard=True), StepResult(1, 0.5, 20.0, 100, 0, 0)
+    log, line = MetricsLog(tmp_path, tensorboard=True), StepResult(1, 0.5, 20.0, 100, 0)
     log.train(line, 1.0)
     with pytest.raises(WriteFailed, match=f"^{tmp_path / CURVE}: can't be written"), largest_file(1000):
         draw_curve(tmp_path)

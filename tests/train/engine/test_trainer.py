@@ -305,16 +305,6 @@ def test_weighted_regularizers_are_added_to_the_loss(
         assert float(loss) == pytest.approx(float(expected), rel=tolerance("float32.relative"))
 
 
-def test_clamped_scales_are_counted(data: Path) -> None:
-    model = dataclasses.replace(small_config().model, scale_space="linear")
-    trainer = Trainer(small_config(model=model, static_fraction=0.0), load_scene(data))
-    assert trainer.step().clamped_scales == 0
-    with torch.no_grad():
-        splatting(trainer).model.get_parameter("deformation.layers.0.heads.bias")[4] = -1e3
-    result = trainer.step()
-    assert result.clamped_scales == result.gaussians
-
-
 def test_an_outlier_of_a_gradient_is_clipped(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(system_module, "photometric_loss", lambda rgb, target, *parts: 1e9 * (rgb - target).sum() ** 2)
     trainer = trained(small_config(steps=100, static_fraction=0.0), load_scene(data), 3)
