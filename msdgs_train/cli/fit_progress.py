@@ -24,8 +24,8 @@ from msdgs_train.systems.base import RaySystem
 UPDATE_SECONDS = 0.5
 PLAIN_LINE_SECONDS = 10.0  # between lines if the output is not a terminal
 NOT_ALL_KEPT = (
-    "warning: decoded training images take {needed:.1f} GiB, of which {kept:g} stay in memory. The others are read and "
-    "downscaled again whenever they are drawn: --image-memory {all} keeps all, and a smaller --size needs less"
+    "warning: decoded images take {needed:.1f} GiB, of which {kept:g} stay in memory. The others are read and decoded "
+    "again whenever they are drawn: --image-memory {all} keeps all, and a smaller --size needs less"
 )
 
 
@@ -63,7 +63,8 @@ class FitProgress(Observer):
         self._print(summary(trainer.scene, trainer.background))
         for warning in trainer.scene.warnings:
             self._print(f"warning: {warning}", style="yellow")
-        kept, needed = trainer.config.run.image_memory, trainer.bytes_of_images / 2**30
+        run, needed = trainer.config.run, trainer.bytes_of_images / 2**30
+        kept = run.image_memory if run.device == "cpu" else max(run.image_memory, run.gpu_image_memory)
         if needed > kept and not isinstance(trainer.system, RaySystem):
             self._print(NOT_ALL_KEPT.format(needed=needed, kept=kept, all=math.ceil(needed)), style="yellow")
         if isinstance(trainer.system, RaySystem):

@@ -222,9 +222,10 @@ class Trainer:
 
     @property
     def bytes_of_images(self) -> int:
-        """What all training images take in memory; their halves, too, if some are still drawn at half the size."""
-        frames = self.scene.splits["train"]
-        halves = (frame.halved() for frame in frames if self.schedule.halves(frame.camera.width, self.step_count))
+        """What all images take in memory; halves of training images, too, if some are still drawn at half the size."""
+        frames = (frame for split in self.scene.splits.values() for frame in split)
+        training = self.scene.splits["train"]
+        halves = (frame.halved() for frame in training if self.schedule.halves(frame.camera.width, self.step_count))
         return bytes_of(frames) + bytes_of(halves)
 
     def _generators(self) -> list[torch.Generator]:

@@ -25,8 +25,8 @@ def activated_scales(log_scales: Tensor) -> Tensor:
 def add_to_scales(space: ScaleSpace, log_scales: Tensor, deltas: Tensor) -> Tensor:
     """Deformed standard deviations, [N, 3]; `deltas` are of logarithms or of scales.
 
-    Scales that deltas make negative count by their absolute value: covariances have their squares, and so has the
-    rasterizer of 3D Gaussian Splatting. With a bound of 0 they would stay there, as they would have no gradient.
+    Scales that deltas make negative count by their absolute value: covariances depend on their squares only, in the
+    rasterizer of 3D Gaussian Splatting too. With a bound at 0, scales below it would have no gradient and stay there.
     """
     if space == "log":
         return activated_scales(log_scales + deltas)

@@ -50,6 +50,15 @@ def test_halves_are_rounded_up(alpha: int):
     assert (reduced == upper).all()
 
 
+@pytest.mark.parametrize(("side", "half"), [(98, 49), (196, 98), (800, 400)])
+def test_transparent_areas_beside_opaque_ones_are_black(side: int, half: int):
+    rgba = np.zeros((side, side, 4), np.uint8)
+    rgba[np.arange(side) // 2 % 2 == 0] = 255
+    reduced = resize_area(rgba, half, half)
+    assert (reduced == rgba[::2, ::2]).all()
+    assert (resize_area(rgba.swapaxes(0, 1), half, half) == reduced.swapaxes(0, 1)).all()
+
+
 def test_the_same_size_changes_nothing():
     rgba = image(0, 12, 8)
     rgba[:3, :5, 3] = 0

@@ -69,9 +69,12 @@ def test_images_that_are_not_kept_give_the_same_steps(data: Path) -> None:
     assert [kept.step().loss for _ in range(STEPS)] == [read_again.step().loss for _ in range(STEPS)]
 
 
-@pytest.mark.parametrize(("halved", "of_one"), [(0.0, 4 * SIZE**2), (0.5, 5 * SIZE**2)])
-def test_images_take_so_many_bytes(halved: float, of_one: int, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("halved", "of_training"), [(0.0, 4 * SIZE**2), (0.5, 5 * SIZE**2)])
+def test_images_take_so_many_bytes(
+    halved: float, of_training: int, data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(schedule_module, "HALVED_WIDTH", SIZE)
     scene = load_scene(data)
     trainer = Trainer(small_config(steps=STEPS, half_resolution_fraction=halved), scene)
-    assert trainer.bytes_of_images == of_one * len(scene.splits["train"])
+    held_out = sum(len(frames) for split, frames in scene.splits.items() if split != "train")
+    assert trainer.bytes_of_images == of_training * len(scene.splits["train"]) + 4 * SIZE**2 * held_out
