@@ -63,14 +63,14 @@ class FitProgress(Observer):
         self._print(summary(trainer.scene, trainer.background))
         for warning in trainer.scene.warnings:
             self._print(f"warning: {warning}", style="yellow")
-        run, needed = trainer.config.run, trainer.bytes_of_images / 2**30
-        kept = run.image_memory if run.device == "cpu" else max(run.image_memory, run.gpu_image_memory)
-        if needed > kept and not isinstance(trainer.system, RaySystem):
-            self._print(NOT_ALL_KEPT.format(needed=needed, kept=kept, all=math.ceil(needed)), style="yellow")
         if isinstance(trainer.system, RaySystem):
             self.elements, phases = "vertices", []
         else:
             phases = trainer.schedule.phases()
+            run, needed = trainer.config.run, trainer.bytes_of_images / 2**30
+            kept = run.image_memory if run.device == "cpu" else max(run.image_memory, run.gpu_image_memory)
+            if needed > kept:
+                self._print(NOT_ALL_KEPT.format(needed=needed, kept=kept, all=math.ceil(needed)), style="yellow")
         width = max((len(phase.name) for phase in phases), default=0)
         for phase in phases:
             self._print(f"{phase.name:{width}}  steps {phase.first + 1:,} to {phase.stop:,}")

@@ -1,5 +1,6 @@
 """A cache of decoded images and masks."""
 
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import cast
@@ -10,7 +11,6 @@ from torch import Tensor
 
 from msdgs_train.datasets import Frame, composite
 
-MAX_BYTES = 2 << 30
 CHANNELS = 4
 
 
@@ -18,7 +18,7 @@ class ImageCache:
     """Keeps decoded images as uint8 RGBA, and masks as bool, up to `max_bytes`; others are read whenever they are asked
     for."""
 
-    def __init__(self, max_bytes: float = MAX_BYTES) -> None:
+    def __init__(self, max_bytes: float = math.inf) -> None:
         self._max_bytes = max_bytes
         self._pixels: dict[tuple[Path, int, bool], np.ndarray] = {}
         self._bytes = 0

@@ -22,8 +22,8 @@ from msdgs_serve.scene.baked import CONSTANT_OUTPUTS
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.model_file import SceneInfo
-from tests.support.memory import measured
 from tests.support.models import MLP, random_model
+from tests.support.processes import run_python
 from tests.support.scene_files import write_scene
 from tests.support.splat_files import some_gaussians
 from tests.support.tolerances import tolerance
@@ -152,6 +152,17 @@ def test_several_callers_at_once(session: DeformationSession):
     assert together == alone
 
 
+POSE = """
+import sys
+from msdgs_serve.deformation import DeformationSession
+from tests.support.memory import measured
+
+session = DeformationSession(sys.argv[1])
+session.pose(0.5, range(2 * 2048))  # compiles kernels and fills caches
+print(measured(lambda: session.pose(0.5))[1])
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory is read from Linux's /proc")
 def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
@@ -162,12 +173,10 @@ def test_memory_does_not_grow_with_gaussians_times_width(tmp_path: Path):
             model.gaussians, name, torch.nn.Parameter(parameter.detach().repeat(count, *[1] * (parameter.ndim - 1)))
         )
     path = written(tmp_path / "scene.onnx", model)
-    session = DeformationSession(path)
-    session.pose(0.5, range(2 * 2048))  # compiles kernels and fills caches
-    _, grown_mb = measured(lambda: session.pose(0.5))
+    grown_mb = float(run_python(POSE, path))  # alone in its process: other work there would count
     activation_mb = count * width * 4 / 2**20
     outputs_mb = count * 10 * 4 / 2**20
-    assert grown_mb < outputs_mb + 0.5 * activation_mb  # a quarter is at times the allocator's own
+    assert grown_mb < outputs_mb + 0.25 * activation_mb
 
 
 @pytest.mark.parametrize("shift", range(4))
