@@ -2,7 +2,7 @@
 
 LPIPS has two conventions: `lpips` is its definition, the distance of images scaled to [−1, 1] (Zhang et al. 2018);
 `lpips_01` is what the scripts of 3D Gaussian Splatting and of systems after it report, the same network on images left
-in [0, 1], which gives lower values.
+in [0, 1], which gives lower values for most renderings.
 """
 
 import importlib
