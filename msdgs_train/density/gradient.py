@@ -91,9 +91,10 @@ class GradientStrategy(DensityStrategy):
         """Clone small and split large Gaussians of large gradients, remove low-opacity and huge ones, and reset."""
         gaussians = surgery.gaussians
         with torch.no_grad():
-            pruned = self._to_prune(gaussians, step)
-            chosen = self._to_densify(pruned)
-            large = gaussians.log_scales.exp().amax(dim=1) > self.config.grow_scale3d * self.scene_scale
+            hidden, sizes = self._hidden(gaussians), gaussians.log_scales.exp().amax(dim=1)
+            chosen, large = self._to_densify(hidden), sizes > self.config.grow_scale3d * self.scene_scale
+            pruned = self._to_prune(hidden, torch.where(chosen & large, sizes / SPLIT_SHRINK, sizes), step)
+            chosen &= ~pruned
             cloned, split = (torch.nonzero(m)[:, 0] for m in (chosen & ~large, chosen & large))
             halves = self._halves(gaussians, split.repeat(2))
             added = {name: torch.cat([p[cloned], halves[name]]) for name, p in gaussians.named_parameters()}
@@ -109,21 +110,28 @@ class GradientStrategy(DensityStrategy):
         ceiling = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
         surgery.replace_values("raw_opacities", surgery.gaussians.raw_opacities.detach().clamp(max=ceiling))
 
-    def _to_prune(self, gaussians: CanonicalGaussians, step: int) -> Tensor:
-        pruned = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
+    def _hidden(self, gaussians: CanonicalGaussians) -> Tensor:
+        """[N] bool: of low opacity, or unseen for too long."""
+        hidden = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
         if self.patience:
-            pruned |= self.unseen > self.patience
-        if self.schedule.has_reset(step):
-            pruned |= gaussians.log_scales.exp().amax(dim=1) > self.config.prune_scale3d * self.scene_scale
-        if bool(pruned.all()):  # a scene that is wholly transparent keeps its Gaussians and may recover
-            return torch.zeros_like(pruned)
-        return pruned
+            hidden |= self.unseen > self.patience
+        if bool(hidden.all()):  # a scene that is wholly transparent keeps its Gaussians and may recover
+            return torch.zeros_like(hidden)
+        return hidden
 
-    def _to_densify(self, pruned: Tensor) -> Tensor:
+    def _to_prune(self, hidden: Tensor, sizes: Tensor, step: int) -> Tensor:
+        """[N] bool: hidden ones, and after a reset huge ones, unless that were all. `sizes`, [N] in scene units, are
+        those after a split, which comes first."""
+        if not self.schedule.has_reset(step):
+            return hidden
+        pruned = hidden | (sizes > self.config.prune_scale3d * self.scene_scale)
+        return hidden if bool(pruned.all()) else pruned
+
+    def _to_densify(self, hidden: Tensor) -> Tensor:
         """[N] bool: large gradients, the largest first up to the maximum number."""
-        mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(pruned, 0.0)
+        mean = (self.gradients / self.counts.clamp(min=1)).masked_fill(hidden, 0.0)
         chosen = mean >= self.config.grow_grad2d
-        room = self.max_gaussians - int((~pruned).sum())
+        room = self.max_gaussians - int((~hidden).sum())
         if int(chosen.sum()) > room:
             strongest = torch.sort(mean, descending=True, stable=True).indices[: max(room, 0)]
             chosen = torch.zeros_like(chosen).index_fill_(0, strongest, True)

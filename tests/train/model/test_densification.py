@@ -109,6 +109,27 @@ def test_low_opacity_gaussians_are_pruned_at_once_and_huge_ones_after_a_reset() 
     assert moment_rows(surgery, "means") == [3, 4, 5, 6]
 
 
+@pytest.mark.parametrize(("size", "split"), [(0.15, True), (0.17, False)])
+def test_huge_ones_are_split_before_they_are_removed(size: float, split: bool) -> None:
+    """A size, as a fraction of the scene's scale, counts after its split: 0.15 / 1.6 is below 0.1."""
+    gaussians, surgery, control = _setup(reset_every_fraction=9 / 24)
+    with torch.no_grad():
+        gaussians.log_scales[1] = math.log(size * EXTENT)
+    _accumulate(control, [0, 1, 0, 0, 0, 0])
+    assert control.densify(surgery, 12) == (0, int(split), int(not split))
+    assert moment_rows(surgery, "means") == [1, 3, 4, 5, 6, *([0, 0] if split else [])]
+
+
+def test_the_cap_holds_where_all_are_hidden_or_huge() -> None:
+    gaussians, surgery, control = _setup(reset_every_fraction=9 / 24, max_gaussians=7)
+    with torch.no_grad():
+        gaussians.raw_opacities[:3] = -10.0
+        gaussians.log_scales[3:] = math.log(0.2 * EXTENT)
+    _accumulate(control, [1.0] * 6)
+    assert control.densify(surgery, 12) == (0, 3, 3)
+    assert len(gaussians) == 6
+
+
 def test_gaussians_that_no_image_shows_are_removed() -> None:
     """Of six, four are seen, one has no gradient and one isn't drawn."""
     gaussians, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.0, refine_every_fraction=0.0)
@@ -133,7 +154,7 @@ def test_a_growing_window_may_hide_gaussians() -> None:
         for _ in range(2 * MIN_PATIENCE):
             control.accumulate(_screen(torch.zeros(6, 2)), 2, 2, False)
             control.after_step(surgery, range(12, 13))
-        assert int(control._to_prune(surgery.gaussians, 12).sum()) == 0
+        assert int(control._hidden(surgery.gaussians).sum()) == 0
         assert int((control.unseen > control.patience).sum()) == pruned
 
 
