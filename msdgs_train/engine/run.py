@@ -169,6 +169,7 @@ class Run:
         self.selection_split = _selection_split(state.trainer.scene)
         self._now = time.process_time if self.config.run.time == "cpu" else time.perf_counter
         self.started = self._now() - state.seconds
+        self.deforming_cost = 1.0  # in steps without deformation
         self.clock, self.advance = self._new_clock(), 1
         self.evaluation_seconds = MAX_EVALUATION_SHARE * state.seconds
 
@@ -176,7 +177,7 @@ class Run:
         """Train until the last step or an interruption, then evaluate and save."""
         self.observer.on_train_start(self.trainer)
         if self.clock and self.trainer.step_count < self.config.run.steps:
-            self._compile_kernels()
+            self._prepare_clock()
         status = self._train()
         if not (status == "interrupted" and self.trainer.is_skipping and (self.folder / CHECKPOINT).exists()):
             self._save()
@@ -190,16 +191,28 @@ class Run:
         size = self.trainer.system.size
         return RunResult(status, self.trainer.step_count, metrics, size, self._seconds(), self.record.best)
 
-    def _compile_kernels(self) -> None:
-        """Train and evaluate for a few steps with another trainer. On a new machine kernels take a minute to compile,
-        which doesn't count as training time."""
+    def _prepare_clock(self) -> None:
+        """Compile kernels, which takes a minute on a new machine, and measure what motion costs, by a few steps of
+        another trainer. Their time doesn't count as training time."""
         before, trial = self._now(), Trainer(self.config, self.trainer.scene)
         for _ in range(TRIAL_STEPS):
             if not self.observer.should_stop():
                 trial.step(max(self.config.run.steps // TRIAL_STEPS, 1))
         for split in self.splits[:1]:
             next(trial.evaluate(split))
+        deform_start = self.trainer.schedule.deform_start_step
+        if self.trainer.step_count < deform_start and self.trainer.schedule.deforms(deform_start):
+            self.deforming_cost = self._seconds_of_rehearsal(trial, deform_start) / self._seconds_of_rehearsal(trial, 0)
+            self.clock = self._new_clock()
         self.started += self._now() - before
+
+    def _seconds_of_rehearsal(self, trial: Trainer, step: int) -> float:
+        taken = []
+        for _ in range(TRIAL_STEPS):
+            before = self._now()
+            trial.rehearse(step)
+            taken.append(self._now() - before)
+        return max(min(taken), 1e-9)
 
     def _train(self) -> Status:
         steps = self.config.run.steps
@@ -235,7 +248,10 @@ class Run:
     def _new_clock(self) -> Clock | None:
         run, splits = self.config.run, self.trainer.scene.splits
         held_out = sum(len(splits[split]) for split in self.splits)
-        return Clock(run.steps, 60 * run.minutes, held_out, self.trainer.step_count) if run.minutes else None
+        if not run.minutes:
+            return None
+        static = self.trainer.schedule.deform_start_step
+        return Clock(run.steps, 60 * run.minutes, held_out, self.trainer.step_count, static, self.deforming_cost)
 
     def _is_stopped(self) -> bool:
         """Wait while paused, which doesn't count as training time; whether the run is to stop."""

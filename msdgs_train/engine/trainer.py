@@ -119,6 +119,14 @@ class Trainer:
         self.system.after_step(self.optimizer, self.reached, seen)
         return self._result()
 
+    def rehearse(self, step: int) -> None:
+        """Compute the gradients of one training image as in this step of the schedule, which becomes the present one,
+        without training on them: for timings."""
+        self.step_count = step
+        frame = self.scene.splits["train"][0]
+        view = self._differentiate(self.system.parameter_groups(), frame, self._next_background(), number=0)
+        float(view.loss)  # waits for a GPU
+
     def _result(self) -> StepResult:
         meter, every, last = self._meter, self.config.logging.log_every, self.config.run.steps
         if any(step % every == 0 or step == last for step in self.reached) or self.optimizer_steps % READ_EVERY == 0:

@@ -38,6 +38,20 @@ def test_it_spends_the_time_evenly_whatever_a_step_costs(steps: int, evaluation:
     assert halfway == pytest.approx(steps / 2, rel=0.05)
 
 
+@pytest.mark.parametrize("measured", [5.0, 4.0])
+def test_faster_static_steps_have_their_share_of_the_steps(measured: float) -> None:
+    """Steps become five times slower where motion begins; the factor is measured before, with an error."""
+    static, position, seconds, counts = 1_600, 0, 0.0, [0, 0]
+    clock = Clock(STEPS, LIMIT, 0, 0, static, measured)
+    while position < STEPS:
+        cost = 0.01 if position < static else 0.05
+        counts[position >= static] += 1
+        seconds += cost
+        position += clock.advance(position, cost, IMAGES, seconds)
+    assert seconds == pytest.approx(LIMIT, rel=0.01)
+    assert counts[0] / sum(counts) == pytest.approx(static / STEPS, rel=0.03 if measured == 5 else 0.25)
+
+
 def test_it_goes_on_from_where_a_stopped_run_was() -> None:
     clock = Clock(STEPS, LIMIT, 0, STEPS // 2)
     advances = [clock.advance(STEPS // 2, 1.0, IMAGES, 151.0 + i) for i in range(3)]
