@@ -6,8 +6,8 @@ SMOOTHING = 0.9  # of the time of an image: a moving average over about 10 steps
 class Clock:
     """Lays a schedule out over the time that is left, whatever a step costs in each phase.
 
-    Steps without deformation are faster by a factor that is known from the start, so that they have their share of the
-    steps. With a share of the time, they would be a third of Grid4D's steps instead of 7 %.
+    Published loops begin with a share of the steps without deformation, which are faster. They get this share if the
+    factor is known; with as large a share of the time, it would be a third of Grid4D's steps instead of 7 %.
     """
 
     def __init__(

@@ -200,8 +200,8 @@ class Run:
                 trial.step(max(self.config.run.steps // TRIAL_STEPS, 1))
         for split in self.splits[:1]:
             next(trial.evaluate(split))
-        deform_start = self.trainer.schedule.deform_start_step
-        if self.trainer.step_count < deform_start and self.trainer.schedule.deforms(deform_start):
+        schedule, deform_start = self.trainer.schedule, self.trainer.schedule.deform_start_step
+        if not schedule.grows_window and schedule.deforms(deform_start) and self.trainer.step_count < deform_start:
             self.deforming_cost = self._seconds_of_rehearsal(trial, deform_start) / self._seconds_of_rehearsal(trial, 0)
             self.clock = self._new_clock()
         self.started += self._now() - before

@@ -61,9 +61,14 @@ class Schedule(NamedTuple):
             ema_steps=_interval(config.optimizer.ema_fraction, steps),
         )
 
+    @property
+    def grows_window(self) -> bool:
+        """Whether motion begins in a time window that grows."""
+        return len(self.config.model.layers) > 0 and self.config.curriculum.window_full_fraction > 0
+
     def phases(self) -> list[Phase]:
         """The phases of at least one step, in order."""
-        if not self.config.model.layers or self.config.curriculum.window_full_fraction == 0:
+        if not self.grows_window:
             start = min(self.deform_start_step, self.num_steps) if self.config.model.layers else self.num_steps
             found = [Phase("static, all images", 0, start), Phase("all times", start, self.num_steps)]
         else:
