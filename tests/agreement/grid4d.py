@@ -22,6 +22,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tests.agreement.fields import write
+
 VECTORS = Path(__file__).with_suffix(".npz")
 TIMES = (0.0, 0.37, 1.0)
 RATES = {"position_lr_init": 1.6e-4, "position_lr_final": 1.6e-6, "network_lr_scale": 5.0, "grid_lr_scale": 50.0}
@@ -221,8 +223,6 @@ def recorded(make: Any, turned: Any, case: Case) -> dict[str, np.ndarray]:
 
 def main(checkout: Path) -> None:
     """Write the vectors."""
-    ran = ["git", "-C", str(checkout), "rev-parse", "HEAD"]
-    commit = subprocess.run(ran, check=True, capture_output=True, text=True).stdout.strip()
     with tempfile.TemporaryDirectory() as folder:
         sys.path.insert(0, str(checkout))
         sys.modules["hashencoder.backend"] = stand_in(compiled(checkout, Path(folder)))
@@ -234,11 +234,11 @@ def main(checkout: Path) -> None:
         from scene.deform_model import DeformModel  # type: ignore[import-not-found]
         from utils.general_utils import quaternion_to_matrix  # type: ignore[import-not-found]
 
-        found = {"commit": np.array(commit)}
+        found = dict[str, np.ndarray]()
         for name, case in CASES.items():
             values = recorded(DeformModel, quaternion_to_matrix, case)
             found |= {f"{name}.{key}": value for key, value in values.items()}
-    np.savez_compressed(VECTORS, **found)  # pyright: ignore[reportArgumentType]
+    write(VECTORS, checkout, "tests.agreement.grid4d", **found)
 
 
 if __name__ == "__main__":

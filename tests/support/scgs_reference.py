@@ -1,13 +1,12 @@
 """What SC-GS's own modules compute, stored in `tests/train/scgs/vectors.npz`.
 
-    python -m tests.support.scgs_reference PATH
+    python -m tests.support.scgs_reference CHECKOUT
 
 writes the file from a checkout of github.com/yihua7/SC-GS, of which only `utils/time_utils.py` and
 `utils/deform_utils.py` run, on the CPU and in float64; pytorch3d's nearest neighbors are replaced by a sort. The state
 is drawn from seeds, so that the file holds results alone.
 """
 
-import subprocess
 import sys
 import types
 from collections import namedtuple
@@ -19,6 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+
+from tests.agreement.fields import write
 
 VECTORS = Path(__file__).parents[1] / "train" / "scgs" / "vectors.npz"
 NODES, GAUSSIANS, HYPER = 24, 40, 8
@@ -159,15 +160,13 @@ def computed(control_node_warp: Callable[..., Any]) -> dict[str, np.ndarray]:
     return {name: value.detach().numpy() for name, value in results.items()}
 
 
-def main(repository: Path) -> None:
+def main(checkout: Path) -> None:
     _stub_modules()
     torch.set_default_dtype(torch.float64)
-    sys.path.insert(0, str(repository))
+    sys.path.insert(0, str(checkout))
     from utils.time_utils import ControlNodeWarp  # pyright: ignore
 
-    head = subprocess.run(["git", "-C", repository, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
-    origin = f"yihua7/SC-GS {head.stdout.strip()}: python -m tests.support.scgs_reference PATH"
-    np.savez_compressed(VECTORS, origin=np.array(origin), **computed(ControlNodeWarp))  # pyright: ignore
+    write(VECTORS, checkout, "tests.support.scgs_reference", **computed(ControlNodeWarp))
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
 """Vectors of the published HexPlane and TiNeuVox, by their own code on a CPU.
 
     git clone https://github.com/Caoang327/HexPlane && git -C HexPlane checkout fc99b61
-    python -m tests.support.volume_references hexplane HexPlane tests/train/volumes/hexplane.npz
+    python -m tests.support.volume_references hexplane HexPlane
     git clone https://github.com/hustvl/TiNeuVox && git -C TiNeuVox checkout d1f3adb
-    python -m tests.support.volume_references tineuvox TiNeuVox tests/train/volumes/tineuvox.npz
+    python -m tests.support.volume_references tineuvox TiNeuVox
 
-Each file has the colors of `RAYS` random rays after 0 and after `STEPS` optimizer steps of the repository's own loop on
-them, with a growth of its grids in between, and its tensors after that; large ones as their first and last
-`KEPT` values. First tensors, rays and colors are those of `seeded` and `scene_of_rays`. Packages that aren't needed are
-empty here, and CUDA kernels are their formulas.
+write `hexplane.npz` and `tineuvox.npz` in `tests/train/volumes`. Each has the colors of `RAYS` random rays after 0 and
+after `STEPS` optimizer steps of the repository's own loop on them, with a growth of its grids in between, and its
+tensors after that; large ones as their first and last `KEPT` values. First tensors, rays and colors are those of
+`seeded` and `scene_of_rays`. Packages that aren't needed are empty here, and CUDA kernels are their formulas.
 """
 
 import argparse
@@ -26,6 +26,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from tests.agreement.fields import write
+
+VECTORS = Path(__file__).parents[1] / "train" / "volumes"
 RAYS, STEPS, GROWN_AFTER, KEPT = 48, 5, 2, 150
 HEX_SIZES = ((12, 4), (15, 6))  # vertices along space and time, before and after
 VOXELS = 9**3  # of TiNeuVox, after its growth
@@ -338,10 +341,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("name", choices=["hexplane", "tineuvox"])
     parser.add_argument("checkout", type=Path)
-    parser.add_argument("out", type=Path)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    np.savez_compressed(arguments.out, **globals()[arguments.name](arguments.checkout.resolve()))
+    name, checkout = arguments.name, arguments.checkout.resolve()
+    arrays = globals()[name](checkout)
+    write(VECTORS / f"{name}.npz", checkout, f"tests.support.volume_references {name}", **arrays)
 
 
 if __name__ == "__main__":

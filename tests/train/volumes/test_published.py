@@ -1,7 +1,6 @@
 """HexPlane-Slim and TiNeuVox against vectors of their own repositories, and their published sizes.
 
-`hexplane.npz` is of github.com/Caoang327/HexPlane at fc99b61, `tineuvox.npz` of github.com/hustvl/TiNeuVox at d1f3adb,
-by the commands in `tests/support/volume_references.py`.
+The vectors are those of `tests/support/volume_references.py`.
 """
 
 import math
