@@ -86,6 +86,24 @@ RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "hash4d": ({"model": MODELS["hash4d"], "batch_size": 2, "threads": 2}, (13,)),
     "mixed on gaussians": ({"model": MODELS["mixed on gaussians"]}, (13,)),
     "mcmc": ({"density_strategy": "mcmc"}, (11,)),
+    "restarted at motion": (
+        {
+            "model": MODELS["mixed on gaussians"],
+            "restart_at_motion": True,
+            "window_full_fraction": 0.0,
+            "batch_size": 2,
+        },
+        (5, 6, 7, 13),
+    ),
+    "raw quaternions, absolute gradients, noise": (
+        {
+            "model": dataclasses.replace(MODELS["mlp"], quat_space="raw", scale_space="linear", embedding_dim=0),
+            "absolute_gradients": True,
+            "time_noise": 0.5,
+            "window_full_fraction": 0.0,
+        },
+        (5, 8, 16),
+    ),
     "default": (
         {
             "model": dataclasses.replace(MODELS["mixed on nodes"], eps2d=0.15),
