@@ -34,9 +34,9 @@ from msdgs_export.target import Target
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
 from msdgs_serve.threads import THREADS_VARIABLE
-from msdgs_train.engine.config import SMALL_LAYER
 from msdgs_train.gaussians.model_file import save_model
 from msdgs_train.supports.nodes import NodesConfig
+from msdgs_train.systems.small import SMALL_LAYER
 from tests.support.models import SCENE, random_model
 
 OPENINGS = 3

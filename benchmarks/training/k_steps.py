@@ -22,11 +22,12 @@ from msdgs_train.comparison.pools import processes
 from msdgs_train.comparison.report import save_figure
 from msdgs_train.comparison.rows import Row, rows_of, runs_left, train_and_measure
 from msdgs_train.comparison.scenes import read_scenes
-from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
+from msdgs_train.engine.config import TrainConfig
 from msdgs_train.layers.base import PAPER_HEADS
 from msdgs_train.layers.bodies import BodiesConfig
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.systems.registry import DEFAULT, preset
+from msdgs_train.systems.small import SMALL_LAYER
 
 STEPS = 2500
 NUM_LAYERS = (1, 2, 4, 10)

@@ -12,23 +12,19 @@ from msdgs_train.datasets.config import DataConfig
 from msdgs_train.density.config import DensityConfig
 from msdgs_train.engine.curriculum_config import CurriculumConfig
 from msdgs_train.gaussians.config import ModelConfig
-from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.plugins import load_plugins
 from msdgs_train.layers.precision import Precision
 from msdgs_train.losses.config import LossConfig
 from msdgs_train.poses.config import PoseConfig
 from msdgs_train.settings import OWN_SETTINGS, Checked, SystemConfig, optional
 
-SMALL_LAYER = MLPConfig(width=96, depth=2, xyz_frequencies=4, time_width=64)
-SMALL_MODEL = ModelConfig(sh_degree=2, layers=(SMALL_LAYER, SMALL_LAYER))
-
 
 @dataclass(frozen=True)
 class RunConfig(Checked):
     """System and length of a run."""
 
-    system: tyro.conf.Suppress[str] = "msdgs-small"
-    """The registered system that builds and trains the model."""
+    system: tyro.conf.Suppress[str] = ""
+    """The registered system that builds and trains the model; Gaussians, if it has no name."""
     steps: int = 16_000
     """Optimizer steps; with --minutes, steps of the schedule."""
     batch_size: int = 1
@@ -138,7 +134,7 @@ class TrainConfig:
     poses: PoseConfig = PoseConfig()
     optimizer: OptimizerConfig = OptimizerConfig()
     logging: LoggingConfig = LoggingConfig()
-    model: ModelConfig = SMALL_MODEL
+    model: ModelConfig = ModelConfig()
     own: SystemConfig = SystemConfig()
 
     def updated(self, **settings: Any) -> "TrainConfig":

@@ -13,8 +13,7 @@ class CurriculumConfig(Checked):
     """The images of each phase of a run."""
 
     static_fraction: float = 0.1
-    """The first fraction of the run trains on all images without deformation, until static parts have converged
-    (warm_up of Deformable-3D-Gaussians, the coarse stage of 4DGaussians)."""
+    """The first fraction of the run trains on all images without deformation, until static parts have converged."""
     static_window_fraction: float = 0.025
     """The next fraction is still without deformation, on the first time window, in which moving objects take shape."""
     window_start_width: float = 0.03
@@ -26,11 +25,9 @@ class CurriculumConfig(Checked):
     """The first fraction of the run trains on images of half the width and height if they are 320 pixels wide or more:
     its steps are faster and add fewer Gaussians."""
     restart_at_motion: Flag = False
-    """Adam, its learning rates and the steps that density control counts start again when motion begins: the two stages
-    of 4DGaussians."""
+    """Adam, its learning rates and the steps that density control counts start again when motion begins."""
     time_noise: float = 0.0
-    """Standard deviation of the noise on the times of training images at the start, in distances between them, as
-    Deformable-3D-Gaussians adds to real scenes (0.1)."""
+    """Standard deviation of the noise on the times of training images at the start, in distances between them."""
     time_noise_fraction: float = 0.5
     """Fraction of the run after which that noise has fallen to 0."""
 

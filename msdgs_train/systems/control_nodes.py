@@ -6,12 +6,13 @@ layers after it share what nearby nodes have in common. In `msdgs-bodies` a few 
 
 from dataclasses import replace
 
-from msdgs_train.engine.config import SMALL_LAYER, TrainConfig
+from msdgs_train.engine.config import TrainConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.bodies import BodiesConfig
 from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems.registry import DEFAULT, register_system
+from msdgs_train.systems.small import SMALL_LAYER
 
 MODEL = ModelConfig(
     sh_degree=2,

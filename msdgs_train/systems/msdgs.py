@@ -6,10 +6,11 @@ from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.systems.deformgs import PUBLISHED
 from msdgs_train.systems.registry import register_system
+from msdgs_train.systems.small import SMALL_MODEL
 
 PAPER_LAYERS = 10
 
-register_system("msdgs-small", "two small MLP layers on the Gaussians themselves", TrainConfig())
+register_system("msdgs-small", "two small MLP layers on the Gaussians themselves", TrainConfig(model=SMALL_MODEL))
 
 register_system(
     "msdgs-mlp",

@@ -57,7 +57,8 @@ def preset(name: str) -> TrainConfig:
 
 def system_of(schedule: Schedule, scene: SceneData) -> ImageSystem | RaySystem:
     """A new system for a run's settings."""
-    build = _entry(schedule.config.run.system).build
+    name = schedule.config.run.system
+    build = _entry(name).build if name else None
     if build is None:
         from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 

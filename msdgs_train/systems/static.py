@@ -2,8 +2,9 @@
 
 from dataclasses import replace
 
-from msdgs_train.engine.config import SMALL_MODEL, TrainConfig
+from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import register_system
+from msdgs_train.systems.small import SMALL_MODEL
 
 register_system(
     "static",

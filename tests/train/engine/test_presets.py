@@ -22,6 +22,7 @@ from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.settings import SystemConfig
 from msdgs_train.systems import registry
 from msdgs_train.systems.registry import DEFAULT, preset, register_system, systems
+from tests.support.processes import ROOT
 from tests.support.training_scene import GAUSSIANS, shrunk, small_config, splatting
 
 pytestmark = pytest.mark.slow
@@ -90,8 +91,21 @@ def test_table_4() -> None:
     assert [in_millions(sizes(two[i], n)[1]) for i, n in ((0, 106_500), (1, 52_800))] == [3.41, 1.69]
 
 
-def test_the_defaults_of_settings_are_a_preset() -> None:
-    assert preset("msdgs-small") == TrainConfig()
+PUBLISHED = ("Deformable-3D-Gaussians", "4DGaussians", "HexPlane", "TiNeuVox")
+
+
+def test_the_engine_names_no_system() -> None:
+    """Neither registered nor published ones; `static` is a phase, too."""
+    names = {*systems(), *PUBLISHED} - {"static"}
+    for file in (ROOT / "msdgs_train" / "engine").glob("*.py"):
+        text = file.read_text(encoding="utf-8").lower()
+        assert not [name for name in names if name.lower() in text], file.name
+
+
+def test_settings_without_a_system_train_gaussians(data: Path) -> None:
+    config = small_config()
+    assert config.run.system == ""
+    splatting(Trainer(config, load_scene(data)))
 
 
 def test_a_config_names_its_system() -> None:
