@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from benchmarks.paper.crops import crops
 from benchmarks.paper.sections import Section
 from benchmarks.paper.tables import MEAN, Method, Table
+from msdgs_train.comparison.best import COLUMNS, HEADING, NOTE, best_evaluation
 from msdgs_train.comparison.gains import gain, machines_of, mean_and_deviation, values_of
 from msdgs_train.comparison.matrix import Budget, Run
 from msdgs_train.comparison.rows import Row
@@ -86,6 +87,7 @@ def sections(results: Results) -> Iterator[Section]:
             section = _numbers(results, heading, column, digits, published)
             if published is not None or any(set(line[1:]) != {NONE} for line in section.lines):
                 yield section
+    yield _best(results)
     yield _gains(results)
     yield _gaps(results)
     yield _parameters(results)
@@ -147,6 +149,16 @@ def _cell(ours: str, method: Method, scene: str, digits: int, published: int | N
         return ours
     numbers = method.numbers.get(scene)
     return f"{ours} / {f'{numbers[published]:.{digits}f}' if numbers else NONE}"
+
+
+def _best(results: Results) -> Section:
+    """Of each method and scene that has runs."""
+    lines = []
+    for method, scene in itertools.product(results.table.methods, dict.fromkeys(s for s, _ in results.columns())):
+        name, _ = results.trained.get(method.name, ("", None))
+        if cells := best_evaluation(results.rows, scene, name):
+            lines.append([method.name, scene, *cells])
+    return Section(HEADING, ["", "scene", *COLUMNS], lines, [NOTE] if lines else [])
 
 
 def _gains(results: Results) -> Section:

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from msdgs_serve.writing import replacing, write_text
+from msdgs_train.comparison.best import best_as_markdown
 from msdgs_train.comparison.gains import mean_and_deviation, scenes_as_markdown
 from msdgs_train.comparison.results import Result
 from msdgs_train.comparison.rows import Row
@@ -48,7 +49,7 @@ def write_comparison(
     """
     out.mkdir(parents=True, exist_ok=True)
     text = [as_markdown(results)] if results else []
-    text.append(scenes_as_markdown(rows, systems))
+    text += [scenes_as_markdown(rows, systems), best_as_markdown(rows, systems)]
     if missing:
         text.append(f"{missing} runs are not finished and are not in the tables.\n")
     write_text(out / TABLE, "\n".join(text))

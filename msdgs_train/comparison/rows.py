@@ -21,15 +21,18 @@ from msdgs_train.comparison.scenes import SPLITS
 from msdgs_train.engine.metrics_log import read_metrics
 from msdgs_train.evaluation.evaluate import Evaluation, evaluate_run
 
+BEST = ("best_split", "best_step", "best_psnr")
 KEY = ("scene", "system", "seed", "minutes", "time", "threads", "settings")
 COLUMNS = (
     "date", "machine", *KEY, "seconds", "optimizer_steps", "gaussians", "parameters", "modulation_parameters",
     "train_psnr",
     *(f"{split}_{name}" for split in SPLITS for name in ("psnr", "ssim", "lpips", "lpips_01", "moving_psnr", "images")),
+    *BEST,
 )  # fmt: skip
 """`parameters` are those of the deformation; those of the modulation, embeddings included, are apart. `*_images` has
 the PSNR of each image, in order; `*_moving_psnr` only where the region is known from the images; `train_psnr` is the
-moving average of the last steps."""
+moving average of the last steps. `best_*` are of the best evaluation during training, by the PSNR of a split; rows of
+earlier versions have none."""
 
 Row = dict[str, str]
 
@@ -47,14 +50,17 @@ def key_of_row(row: Row) -> tuple[str, ...]:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a CSV file; none if there is no such file. Raises `InvalidInput` if it has other columns."""
+    """The rows of a CSV file; none if there is no such file; values of `BEST` are empty where it has no such columns.
+
+    Raises `InvalidInput` if it has other columns.
+    """
     if not path.exists():
         return []
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) != COLUMNS:
+        if tuple(reader.fieldnames or ()) not in (COLUMNS, COLUMNS[: -len(BEST)]):
             raise InvalidInput("csv", f"a file with the columns {', '.join(COLUMNS)}", path)
-        return list(reader)
+        return [dict.fromkeys(BEST, "") | row for row in reader]
 
 
 def append_row(path: Path, row: Row) -> None:
@@ -108,6 +114,8 @@ def measure(run: Run) -> Row:
         "gaussians": str(metrics["gaussians"]),
         "train_psnr": f"{[line for line in read_metrics(run.folder) if line['kind'] == 'train'][-1]['psnr']:.3f}",
     }
+    if best := metrics["best"]:
+        row |= {"best_split": best["split"], "best_step": str(best["step"]), "best_psnr": f"{best['psnr']:.4f}"}
     for split in SPLITS:
         if split in run.splits and split in metrics["splits"]:
             evaluation = evaluate_run(run.folder, run.data, split, brief=True)

@@ -11,10 +11,11 @@ import pytest
 
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.cli import main as cli
+from msdgs_train.comparison.best import best_as_markdown, best_evaluation
 from msdgs_train.comparison.gains import paired_gain, scenes_as_markdown
 from msdgs_train.comparison.matrix import Budget, Run, make_runs
 from msdgs_train.comparison.report import write_comparison
-from msdgs_train.comparison.rows import COLUMNS, KEY, Row, append_row, key_of, key_of_row, read_rows, rows_of
+from msdgs_train.comparison.rows import BEST, COLUMNS, KEY, Row, append_row, key_of, key_of_row, read_rows, rows_of
 from msdgs_train.comparison.scenes import read_scenes
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import preset
@@ -124,6 +125,9 @@ def test_the_same_command_goes_on_from_its_rows(data: Path, capsys: pytest.Captu
     assert float(first["test_psnr"]) > 0
     assert len(first["val_images"].split()) > 0
     assert (first["parameters"], first["modulation_parameters"]) == ("0", "0")
+    assert (first["best_split"], first["best_step"].isdigit()) == ("val", True)
+    assert float(first["best_psnr"]) >= float(first["val_psnr"]) - 1e-3
+    assert f"| tiny | small | val | {float(first['val_psnr']):.2f} |" in (out / "comparison.md").read_text()
     assert cli.main([*command, f"--out={out}"]) == 0
     assert read_rows(rows) == [first]
     assert cli.main([*command, f"--out={data / 'other'}"]) == 0
@@ -241,6 +245,19 @@ def test_gains_are_over_the_first_system_of_the_command_whichever_run_ended_firs
         assert ("1 runs are not finished" in text) == (some is not rows)
 
 
+def test_the_best_evaluation_is_beside_the_last() -> None:
+    best = [
+        {"best_split": "val", "best_step": step, "best_psnr": psnr} for step, psnr in (("3000", "21"), ("5000", "23"))
+    ]
+    rows = [row("s1", "a", seed, [30.0]) | of_seed for seed, of_seed in enumerate(best)]
+    rows += [row("s1", "b", 0, [30.0]), row("s2", "a", 0, [30.0]) | best[0] | {"best_split": "test"}]
+    assert best_evaluation(rows, "s1", "a") == ["val", "20.00 ± 0.00", "22.00 ± 1.41", "4,000 ± 1,414"]
+    assert best_evaluation(rows, "s2", "b") is None
+    text = best_as_markdown(rows, ["a", "b"])
+    assert "| a | s2 | test | 30.00 | 21.00 | 3,000 |" in text
+    assert "| b | s1 | – | – | – | – |" in text
+
+
 def test_an_interval_covers_the_mean_gain() -> None:
     generator = np.random.default_rng(1)
     mean, low, high = paired_gain([generator.normal(0.5, 0.2, 40)])
@@ -254,6 +271,19 @@ def test_rows_of_several_comparisons_are_kept(tmp_path: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda seed: append_row(path, row("s", "a", seed, [1.0])), range(40)))
     assert sorted(int(found["seed"]) for found in read_rows(path)) == list(range(40))
+
+
+def test_rows_of_before_the_best_evaluation_are_read_and_kept(tmp_path: Path) -> None:
+    path, old = tmp_path / "rows.csv", row("s", "a", 0, [1.0])
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [name for name in COLUMNS if name not in BEST], extrasaction="ignore")
+        writer.writeheader()
+        writer.writerow(old)
+    assert read_rows(path) == [old]
+    new = row("s", "a", 1, [2.0]) | dict.fromkeys(BEST, "9")
+    append_row(path, new)
+    assert read_rows(path) == [old, new]
+    assert path.read_text().splitlines()[0] == ",".join(COLUMNS)
 
 
 def test_a_csv_file_of_other_columns_is_refused(tmp_path: Path) -> None:
