@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from rich.console import Console
 
-from benchmarks.paper.tables import PaperBudget, find_scenes, read_systems, read_table
+from benchmarks.paper.tables import PaperBudget, find_scenes, read_systems, read_table, runs_of
 from msdgs_serve.process import EXIT_INTERRUPTED, EXIT_INVALID, begin
 from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.writing import in_words, write_text
 from msdgs_train.cli.compare import comparison_progress
 from msdgs_train.cli.console import console
-from msdgs_train.comparison.matrix import make_runs
 from msdgs_train.settings import Flag, optional
 
 if TYPE_CHECKING:
@@ -38,7 +37,8 @@ class Paper:
 
     The data are the folder of D-NeRF, Neu3D or HyperNeRF with a folder for each scene, single datasets, or TOML files
     of scenes as for `msdgs-train compare`. Scenes that aren't there are dashes, others are added. Without --small each
-    system is trained as its authors publish it, which needs a GPU; --steps and --minutes shorten its schedule.
+    system is trained as its authors publish it for the dataset and, where they do, for a scene (published.toml); the
+    page names what differs. That needs a GPU; --steps and --minutes shorten its schedule.
 
     Each finished run adds a row to a CSV file and renews the page, OUT/TABLE.html and .md. Runs that have a row aren't
     trained again, so that the same command continues after Ctrl-C, also for more seeds, scenes or systems. Tables share
@@ -89,10 +89,10 @@ class Paper:
         scenes = find_scenes(table, self.data)
         require_known("methods", self.methods, [method.name for method in table.methods])
         require_known("scenes", self.scenes, [scene.name for scene in scenes])
-        trained, absent = read_systems(table, self.budget, small=self.small)
+        trained, absent = read_systems(table, scenes, self.budget, small=self.small)
         csv = self.csv or self.out / "paper.csv"
-        runs = make_runs(dict(trained.values()), scenes, self.seeds, self.out)
-        wanted = {system for method, (system, _) in trained.items() if method in self.methods or not self.methods}
+        runs = runs_of(trained, scenes, self.seeds, self.out)
+        wanted = {row.system for method, row in trained.items() if method in self.methods or not self.methods}
         chosen = [run for run in runs if run.system in wanted and (run.scene in self.scenes or not self.scenes)]
         results = Results(table, trained, absent, scenes, runs, (), self.budget, self.small)
 

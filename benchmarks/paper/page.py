@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from benchmarks.paper.crops import crops
 from benchmarks.paper.sections import Section
-from benchmarks.paper.tables import MEAN, Method, Table
+from benchmarks.paper.tables import MEAN, Method, Table, Trained
 from msdgs_train.comparison.best import COLUMNS, HEADING, NOTE, best_evaluation
 from msdgs_train.comparison.gains import gain, machines_of, mean_and_deviation, values_of
 from msdgs_train.comparison.matrix import Budget, Run
@@ -35,7 +35,7 @@ class Results:
     """What a page shows."""
 
     table: Table
-    trained: Mapping[str, tuple[str, TrainConfig]]  # by method, as `read_systems` returns it
+    trained: Mapping[str, Trained]  # by method
     absent: Sequence[str]
     scenes: Sequence[Scene]
     runs: Sequence[Run]
@@ -74,8 +74,11 @@ class Results:
 
     def values(self, method: Method, scene: str, column: str) -> list[float]:
         """A column of the rows of a method's runs on a scene, one per seed."""
-        name, _ = self.trained.get(method.name, ("", None))
-        return [float(value) for value in values_of(self.rows, scene, name, column)]
+        return [float(value) for value in values_of(self.rows, scene, self.system(method.name), column)]
+
+    def system(self, method: str) -> str:
+        """The name of what is trained for a row; empty: nothing."""
+        return self.trained[method].system if method in self.trained else ""
 
 
 def sections(results: Results) -> Iterator[Section]:
@@ -92,6 +95,7 @@ def sections(results: Results) -> Iterator[Section]:
     yield _gaps(results)
     yield _parameters(results)
     yield _runs(results)
+    yield _settings(results)
     yield from _pictures(results)
 
 
@@ -170,7 +174,7 @@ def _gains(results: Results) -> Section:
     for method in table.methods:
         if not method.baseline:
             continue
-        systems = [results.trained.get(name, ("", None))[0] for name in (method.name, method.baseline)]
+        systems = [results.system(name) for name in (method.name, method.baseline)]
         line = [f"{method.name} over {method.baseline}"]
         for scene in [*scenes, MEAN]:
             of = list(table.scenes) if scene == MEAN else [scene]
@@ -217,14 +221,29 @@ def _runs(results: Results) -> Section:
     names = [scene.name for scene in results.scenes]
     for method, scene in itertools.product(results.table.methods, names):
         if seconds := results.values(method, scene, "seconds"):
-            name, config = results.trained[method.name]
+            row = results.trained[method.name]
             columns = ("parameters", "modulation_parameters", "gaussians", "optimizer_steps")
             counts = [f"{statistics.fmean(results.values(method, scene, c)):,.0f}" for c in columns]
             fit = mean_and_deviation(results.values(method, scene, "train_psnr"), 2)
             minutes = f"{statistics.fmean(seconds) / 60:.1f}"
-            lines.append([method.name, name, _layers(config), scene, str(len(seconds)), *counts, minutes, fit])
+            layers = _layers(row.configs[scene])
+            lines.append([method.name, row.system, layers, scene, str(len(seconds)), *counts, minutes, fit])
     columns = ["", "system", "layers", "scene", "seeds", "parameters", "of modulation", "Gaussians", "steps", "minutes"]
     return Section("Runs", [*columns, "PSNR in training, dB"], lines)
+
+
+def _settings(results: Results) -> Section:
+    """What is trained for the dataset and its scenes instead of the presets' settings, and what isn't as published."""
+    if results.small:
+        return Section("Settings", notes=["Small systems have the same settings for all datasets and scenes."])
+    lines = [
+        [method, scene or "all", str(recipe), recipe.source, "; ".join(recipe.differs)]
+        for method, row in results.trained.items()
+        for scene, recipe in row.recipes.items()
+    ]
+    columns = ["", "scene", "instead of the preset's", "from", "published, but not here"]
+    notes = [*results.table.notes, "What the presets themselves leave out is in docs/training.md, Presets."]
+    return Section("Settings", columns, lines, notes)
 
 
 def _layers(config: TrainConfig) -> str:
@@ -234,7 +253,7 @@ def _layers(config: TrainConfig) -> str:
 
 def _pictures(results: Results) -> Iterator[Section]:
     """Of each scene, of the first seed that was trained."""
-    names = {system: method for method, (system, _) in results.trained.items()}
+    names = {row.system: method for method, row in results.trained.items()}
     done = {(row["scene"], row["system"], row["seed"]) for row in results.rows}
     for scene in results.scenes:
         finished = [run for run in results.runs if (run.scene, run.system, str(run.seed)) in done]

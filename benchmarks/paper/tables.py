@@ -1,13 +1,14 @@
 """The tables as TOML files: published numbers, and what is trained for each row."""
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from benchmarks.paper.recipes import Recipe, recipe, scene_recipes
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_train.comparison.matrix import Budget, read_system
+from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_system
 from msdgs_train.comparison.scenes import Scene, read_scenes
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.settings import optional
@@ -58,6 +59,10 @@ class Table:
     scenes: Mapping[str, Sequence[str]]
     """Names of each scene's folder, by the paper's name."""
     methods: Sequence[Method]
+    width: int | None = None
+    """Of images in pixels, where the dataset has larger ones."""
+    notes: Sequence[str] = ()
+    """How all rows differ from what is published."""
 
 
 def read_table(name: str) -> Table:
@@ -82,17 +87,53 @@ def find_scenes(table: Table, sources: Sequence[Path]) -> list[Scene]:
     return [replace(scene, name=spelled.get(_plain(scene.name), scene.name)) for scene in read_scenes(folders)]
 
 
-def read_systems(table: Table, budget: Budget, *, small: bool) -> tuple[dict[str, tuple[str, TrainConfig]], list[str]]:
-    """What is trained for each row, the name of a system and its settings; and the presets of other rows, which are not
-    registered."""
-    definitions, found, absent = _contents("systems"), {}, []
+@dataclass(frozen=True)
+class Trained:
+    """What is trained for a row."""
+
+    system: str
+    """Its name in systems.toml."""
+    configs: Mapping[str, TrainConfig]
+    """By scene."""
+    recipes: Mapping[str, Recipe]
+    """What authors publish for the table's dataset, under an empty name, and what changes for scenes."""
+
+
+def read_systems(
+    table: Table, scenes: Sequence[Scene], budget: Budget, *, small: bool
+) -> tuple[dict[str, Trained], list[str]]:
+    """What is trained for each row on each scene; and the presets of other rows, which are not registered."""
+    definitions, published = _contents("systems"), {} if small else _contents("published")
+    found, absent = {}, []
     for method in table.methods:
         name, settings = _definition(definitions, method.system, "small" if small else "published")
-        if settings["preset"] in systems():
-            found[method.name] = (f"{name} small" if small else name, _config(name, settings, budget))
-        else:
+        if settings["preset"] not in systems():
             absent.append(f"{method.name} ({settings['preset']})")
+            continue
+        base = recipe(published, settings["preset"], table.dataset)
+        changes = scene_recipes(published, settings["preset"], table.dataset)
+        own = {scene.name: changes[key] for scene in scenes if (key := _scene_key(scene, changes))}
+        config = _config(name, settings, table)
+        configs = {scene.name: base.changed(own.get(scene.name, {})).applied(config) for scene in scenes}
+        configs = {scene: budget.of(config) for scene, config in configs.items()}
+        recipes = {"": base} | {scene: Recipe().changed(change) for scene, change in own.items()}
+        found[method.name] = Trained(f"{name} small" if small else name, configs, recipes)
     return found, absent
+
+
+def runs_of(trained: Mapping[str, Trained], scenes: Sequence[Scene], seeds: Sequence[int], out: Path) -> list[Run]:
+    """One run per system, scene and seed, ordered by seed."""
+    runs = []
+    for scene in scenes:
+        configs = {row.system: row.configs[scene.name] for row in trained.values()}
+        runs += make_runs(configs, [scene], seeds, out)
+    return sorted(runs, key=lambda run: seeds.index(run.seed))
+
+
+def _scene_key(scene: Scene, known: Iterable[str]) -> str | None:
+    """The name under which a scene, or its folder, is known."""
+    names = {_plain(scene.name), _plain(scene.folder.name)}
+    return next((name for name in known if _plain(name) in names), None)
 
 
 def _definition(definitions: Mapping[str, Any], name: str, variant: str) -> tuple[str, dict[str, Any]]:
@@ -100,9 +141,11 @@ def _definition(definitions: Mapping[str, Any], name: str, variant: str) -> tupl
     return _definition(definitions, settings, variant) if isinstance(settings, str) else (name, dict(settings))
 
 
-def _config(name: str, settings: dict[str, Any], budget: Budget) -> TrainConfig:
-    num_layers = settings.pop(NUM_LAYERS, None)
-    config = read_system(name, settings, budget)
+def _config(name: str, settings: Mapping[str, Any], table: Table) -> TrainConfig:
+    """The settings of systems.toml, before those of a dataset."""
+    own = {key: value for key, value in settings.items() if key != NUM_LAYERS}
+    config = read_system(name, ({"size": table.width} if table.width else {}) | own, PaperBudget())
+    num_layers = settings.get(NUM_LAYERS)
     return config if num_layers is None else config.updated(layers=config.model.layers[:1] * num_layers)
 
 

@@ -59,6 +59,9 @@ class MLPConfig(LayerConfig):
     """Hidden units of the network of time."""
     time_features: int = 30
     """Outputs of the network of time."""
+    time_network: bool = True
+    """Off: encoded time is read as it is, as by Deformable-3D-Gaussians in real scenes: the network of time is the
+    identity, of the sizes that takes, and isn't trained."""
     skip: int = 0
     """Skip connection: the input is concatenated after so many hidden layers, fewer than `depth`; 0: none."""
     initialization: str = "local"
@@ -99,21 +102,37 @@ class MLPLayer(DeformationLayer):
 
     def __init__(self, config: MLPConfig = MLPConfig(), outputs: Heads = PAPER_HEADS) -> None:
         super().__init__()
-        c = config
-        width, time_features = c.width, c.time_features
+        c, encoded_time = config, 1 + 2 * config.time_frequencies
+        width, time_width, time_features = c.width, c.time_width, c.time_features
+        if not c.time_network:
+            time_width, time_features = 2 * encoded_time, encoded_time
         self.config, self.outputs, self.skip = config, outputs, c.skip
         self.register_buffer("xyz_frequency_matrix", frequency_matrix(3, c.xyz_frequencies), persistent=False)
         self.register_buffer("time_frequency_matrix", frequency_matrix(1, c.time_frequencies), persistent=False)
         self.xyz_features = 3 * (1 + 2 * c.xyz_frequencies)
         self.input_features = self.xyz_features + time_features
-        self.time_hidden = nn.Linear(1 + 2 * c.time_frequencies, c.time_width)
-        self.time_output = nn.Linear(c.time_width, time_features)
+        self.time_hidden = nn.Linear(encoded_time, time_width)
+        self.time_output = nn.Linear(time_width, time_features)
         self.first = nn.Linear(self.input_features, width)  # columns: encoded xyz, then time features
         trunk = [nn.Linear(width + (self.input_features if i == c.skip else 0), width) for i in range(1, c.depth)]
         self.trunk = nn.ModuleList(trunk)  # columns of the one after the skip: as `first`, then hidden units
         self.heads = nn.Linear(width, sum(outputs.sizes))
         if c.initialization == "local":
             self._initialize(trunk)
+        if not c.time_network:
+            self._fix_time()
+
+    @torch.no_grad()
+    def _fix_time(self) -> None:
+        """Make the network of time the identity, as relu(x) - relu(-x), for good."""
+        eye = torch.eye(self.time_hidden.in_features)
+        for linear, weight in (
+            (self.time_hidden, torch.cat([eye, -eye])),
+            (self.time_output, torch.cat([eye, -eye], 1)),
+        ):
+            linear.weight.copy_(weight)
+            linear.bias.zero_()
+            linear.requires_grad_(requires_grad=False)
 
     @torch.no_grad()
     def _initialize(self, trunk: list[nn.Linear]) -> None:
@@ -145,7 +164,8 @@ class MLPLayer(DeformationLayer):
 
     def parameter_groups(self) -> list[ParamGroup]:
         lr = LearningRate(self.config.lr_init, self.config.lr_final, holds=True)
-        return [ParamGroup("network", list(self.parameters()), lr, is_clipped=True)]
+        trained = [parameter for parameter in self.parameters() if parameter.requires_grad]
+        return [ParamGroup("network", trained, lr, is_clipped=True)]
 
 
 def _encode_backward(grad: Tensor, encoded: Tensor, frequencies: Tensor) -> Tensor:

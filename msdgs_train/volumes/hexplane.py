@@ -43,9 +43,9 @@ class HexPlaneConfig(VolumeConfig):
     first_voxels: int = 64**3
     """Vertices of the grid in space in its first size; it grows three times."""
     times: int = 24
-    """Vertices along time in the last size; about half the images are published."""
+    """Vertices along time in the last size; its authors advise 0.24 times the number of training images."""
     first_times: int = 16
-    """Vertices along time in the first size."""
+    """Vertices along time in the first size; half of those in the last are advised."""
     box_half_size: float = 1.5
     """Half the side of the cube around the origin that is modeled, in scene units."""
     grid_lr: float = 0.02

@@ -275,8 +275,9 @@ def initialize_network(layer: MLPLayer, seed: int) -> None:
     """He's uniform initialization of hidden layers, torch's of the network of time, and heads of nearly 0."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        layer.time_hidden.reset_parameters()
-        layer.time_output.reset_parameters()
+        if layer.config.time_network:
+            layer.time_hidden.reset_parameters()
+            layer.time_output.reset_parameters()
         for linear in (layer.first, *cast(list[nn.Linear], list(layer.trunk))):
             nn.init.kaiming_uniform_(linear.weight, nonlinearity="relu")
             nn.init.zeros_(linear.bias)
