@@ -17,6 +17,9 @@ from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.writing import in_words, write_text
 from msdgs_train.cli.compare import comparison_progress
 from msdgs_train.cli.console import console
+from msdgs_train.comparison.scenes import Scene
+from msdgs_train.engine.schedule import Schedule
+from msdgs_train.layers.parts import to_text
 from msdgs_train.settings import Flag, optional
 
 if TYPE_CHECKING:
@@ -158,9 +161,36 @@ def self_test() -> int:
         for name in ("table2", "table3", "table4", "table5", "figure7"):
             assert refused(replace(paper, table=name, methods=("none",))) == "methods"
         assert refused(replace(paper, methods=(), scenes=("none",))) == "scenes"
+        assert_as_published(Path(folder))
         assert refused(replace(paper, data=())) == "data"
     console.print("ok")
     return 0
+
+
+def assert_as_published(folder: Path) -> None:
+    """Each scene is trained as published for it, and the page says so; tests have the numbers."""
+    from benchmarks.paper.page import Results, sections
+
+    table = read_table("table3")
+    scenes = [Scene("Broom", folder, {}), Scene("Chicken", folder, {}), Scene("other", folder / "peel-banana", {})]
+    trained, absent = read_systems(table, scenes, PaperBudget(), small=False)
+    runs = runs_of(trained, scenes, (0, 1), folder)
+    assert not absent
+    assert [(run.scene, run.seed) for run in runs[:: len(trained)]] == [
+        (s.name, seed) for seed in (0, 1) for s in scenes
+    ]
+    layers = [to_text(config.model.layers[0]) for config in trained["4DGS"].configs.values()]
+    assert [f"time_resolution={times}," in layer for times, layer in zip((100, 80, 250), layers, strict=True)] == [
+        True
+    ] * 3
+    assert [config.run.steps for config in trained["Grid4D"].configs.values()] == [30_000, 40_000, 30_000]
+    assert {row.configs["Broom"].data.size for row in trained.values()} == {540}
+    short, _ = read_systems(table, scenes, PaperBudget(steps=170, size=90), small=False)
+    config = short["4DGS"].configs["Broom"]
+    assert (config.data.size, Schedule.from_config(config).restart_step) == (90, 30)
+    page = sections(Results(table, trained, absent, scenes, runs, (), PaperBudget(), False))
+    (lines,) = (section.lines for section in page if section.heading == "Settings")
+    assert [line[1] for line in lines if line[0] == "Grid4D"] == ["all", "Broom", "Chicken", "other"]
 
 
 def refused(paper: Paper) -> str | None:

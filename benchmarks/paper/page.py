@@ -159,8 +159,7 @@ def _best(results: Results) -> Section:
     """Of each method and scene that has runs."""
     lines = []
     for method, scene in itertools.product(results.table.methods, dict.fromkeys(s for s, _ in results.columns())):
-        name, _ = results.trained.get(method.name, ("", None))
-        if cells := best_evaluation(results.rows, scene, name):
+        if cells := best_evaluation(results.rows, scene, results.system(method.name)):
             lines.append([method.name, scene, *cells])
     return Section(HEADING, ["", "scene", *COLUMNS], lines, [NOTE] if lines else [])
 
@@ -242,7 +241,10 @@ def _settings(results: Results) -> Section:
         for scene, recipe in row.recipes.items()
     ]
     columns = ["", "scene", "instead of the preset's", "from", "published, but not here"]
-    notes = [*results.table.notes, "What the presets themselves leave out is in docs/training.md, Presets."]
+    notes = [
+        *results.table.notes,
+        "Phases and intervals keep the preset's steps. What presets leave out is in docs/training.md, Presets.",
+    ]
     return Section("Settings", columns, lines, notes)
 
 

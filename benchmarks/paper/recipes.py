@@ -7,6 +7,9 @@ from typing import Any
 
 from msdgs_train.engine.config import TrainConfig
 
+PHASES = ("static_fraction", "sh_degree_fraction", "refine_start_fraction", "refine_stop_fraction")
+PHASES += ("refine_every_fraction", "reset_every_fraction")
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -17,7 +20,7 @@ class Recipe:
     steps: int | None = None
     """Of a run; None: as many as the preset has."""
     in_steps: Mapping[str, int] = field(default_factory=dict)
-    """Fractions of a run, in steps."""
+    """Fractions of a run, in steps; others of `PHASES` keep the preset's steps."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Others of the run."""
     layer: Mapping[str, Any] = field(default_factory=dict)
@@ -37,10 +40,13 @@ class Recipe:
 
     def applied(self, config: TrainConfig) -> TrainConfig:
         """The settings of a run."""
-        steps = self.steps or config.run.steps
+        steps, kept = self.steps or config.run.steps, {}
+        if steps != config.run.steps:
+            own = {name: value for group in config.to_dict().values() for name, value in group.items()}
+            kept = {name: round(own[name] * config.run.steps) / steps for name in PHASES}
         fractions = {name: count / steps for name, count in self.in_steps.items()}
         layers = [dataclasses.replace(layer, **self.layer) for layer in config.model.layers]
-        return config.updated(steps=steps, layers=layers, **{**self.settings, **fractions})
+        return config.updated(steps=steps, layers=layers, **{**kept, **self.settings, **fractions})
 
     def __str__(self) -> str:
         steps = [] if self.steps is None else [f"{self.steps:,} steps"]

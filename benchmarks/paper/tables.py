@@ -112,7 +112,7 @@ def read_systems(
             continue
         base = recipe(published, settings["preset"], table.dataset)
         changes = scene_recipes(published, settings["preset"], table.dataset)
-        own = {scene.name: changes[key] for scene in scenes if (key := _scene_key(scene, changes))}
+        own = {scene.name: changes[key] for scene in scenes if (key := _scene_key(table, scene, changes))}
         config = _config(name, settings, table)
         configs = {scene.name: base.changed(own.get(scene.name, {})).applied(config) for scene in scenes}
         configs = {scene: budget.of(config) for scene, config in configs.items()}
@@ -130,9 +130,10 @@ def runs_of(trained: Mapping[str, Trained], scenes: Sequence[Scene], seeds: Sequ
     return sorted(runs, key=lambda run: seeds.index(run.seed))
 
 
-def _scene_key(scene: Scene, known: Iterable[str]) -> str | None:
+def _scene_key(table: Table, scene: Scene, known: Iterable[str]) -> str | None:
     """The name under which a scene, or its folder, is known."""
     names = {_plain(scene.name), _plain(scene.folder.name)}
+    names |= {_plain(paper) for paper, aliases in table.scenes.items() if not names.isdisjoint(map(_plain, aliases))}
     return next((name for name in known if _plain(name) in names), None)
 
 

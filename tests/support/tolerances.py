@@ -166,6 +166,8 @@ TABLE = (
     # the paper's tables
     Row("published.psnr", 1e-2, "means are published with two decimals, some rounded down"),
     Row("published.ssim_lpips", 1e-3, "means are published with three decimals, some rounded down, one up"),
+    Row("published.rate.relative", 1e-5, "last values of rates in published.toml have six digits"),
+    Row("published.rate", 1e-12, "the same formula in float64"),
     Row("volume.pixel", 1e-4, "pixels; directions of size 1 in float32, times a focal length of 33"),
     Row("volume.forward", 1e-6, "colors of size 1; published volumes add 1e-10 to what is left behind each sample"),
     Row("volume.trained", 1e-6, "tensors of size 1, float64; as volume.forward, after five steps of Adam"),

@@ -14,6 +14,7 @@ from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians
+from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.gaussians.modulation import Modulation
 from msdgs_train.layers.mlp import MLPConfig, MLPLayer
 from msdgs_train.layers.parameters import LearningRate
@@ -75,6 +76,21 @@ def test_adam_starts_again_with_motion(data: Path) -> None:
         steps.append(int(trainer.optimizer.state[means]["step"]))
     assert trainer.schedule.restart_step == 3
     assert steps == [1, 2, 3, 1, 2]
+
+
+def test_an_encoding_of_time_that_no_network_reads_stays_as_it_is(data: Path, tmp_path: Path) -> None:
+    config = shrunk(preset("deformgs-faithful"))
+    layers = [dataclasses.replace(layer, time_network=False) for layer in config.model.layers]
+    trainer = Trainer(config.updated(layers=layers, static_fraction=0.0, time_noise=0.1), load_scene(data))
+    (layer,) = splatting(trainer).model.deformation
+    before = {name: values.clone() for name, values in layer.state_dict().items()}
+    for _ in range(3):
+        trainer.step()
+    is_same = {name: torch.equal(values, before[name]) for name, values in layer.state_dict().items()}
+    assert {name.split(".")[0] for name, same in is_same.items() if same} == {"time_hidden", "time_output"}
+    splatting(trainer).save(tmp_path / "model.pt", 3)
+    (loaded,) = load_model(tmp_path / "model.pt").model.deformation
+    assert all(torch.equal(values, layer.state_dict()[name]) for name, values in loaded.state_dict().items())
 
 
 def test_table_4_names_the_numbers_of_gaussians() -> None:

@@ -1,7 +1,9 @@
 """The published numbers of benchmarks/paper agree with each other, and its systems can be read."""
 
 import dataclasses
+import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +12,21 @@ import pytest
 
 from msdgs_train.comparison.matrix import Budget, read_system
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.base import SceneBounds
-from msdgs_train.systems.registry import systems
+from msdgs_train.layers.hash4d import Hash4DConfig
+from msdgs_train.layers.mlp import MLPConfig
+from msdgs_train.layers.parameters import LearningRate
+from msdgs_train.layers.parts import from_plain
+from msdgs_train.layers.plane import PlaneConfig
+from msdgs_train.layers.registry import LAYERS
+from msdgs_train.systems.registry import preset, systems
+from msdgs_train.volumes.hexplane import HexPlaneConfig
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close
 
 FOLDER = ROOT / "benchmarks" / "paper"
+NO_PLANES = ("HyperNeRF", "msdgs-plane")  # table 3 doesn't have them
 TABLES = ("table1", "table2", "table3", "table4", "table5", "figure7")
 
 
@@ -73,8 +84,202 @@ def config_of(name: str, variant: str) -> TrainConfig | None:
     num_layers = settings.pop("num_layers", 0)
     if settings["preset"] not in systems():
         return None
-    config = read_system(name, settings, Budget())
+    config = read_system(name, settings, Budget(steps=preset(settings["preset"]).run.steps))
     return config.updated(layers=config.model.layers[:1] * num_layers) if num_layers else config
+
+
+def entries(name: str, dataset: str, scene: str) -> Iterator[dict[str, Any]]:
+    """Those of published.toml that count, the last most."""
+    entry = contents("published")[name][dataset]
+    if "like" in entry:
+        other, dataset = entry["like"]
+        yield from entries(other, dataset, "")
+    yield entry
+    yield entry.get("scenes", {}).get(scene, {})
+
+
+def published(system: str, dataset: str, scene: str) -> TrainConfig:
+    """What is trained for a row on a scene."""
+    config, settings, fractions, layer = config_of(system, "published"), {}, {}, {}
+    assert config is not None
+    c, d, before = config.curriculum, config.density, config.run.steps
+    kept = {"static_fraction": c.static_fraction, "sh_degree_fraction": config.optimizer.sh_degree_fraction}
+    kept |= {name: getattr(d, name) for name in d.names() if name.startswith(("refine_", "reset_"))}
+    steps = before
+    for entry in entries(config.run.system, dataset, scene):
+        steps = entry.get("steps", steps)
+        settings |= entry.get("settings", {})
+        fractions |= entry.get("in_steps", {})
+        layer |= entry.get("layer", {})
+    settings = {name: fraction * before / steps for name, fraction in kept.items()} | settings
+    settings |= {name: count / steps for name, count in fractions.items()}
+    layers = [dataclasses.replace(own, **layer) for own in config.model.layers]
+    return config.updated(steps=steps, layers=layers, **settings)
+
+
+def rates(config: TrainConfig, step: int) -> dict[str, float]:
+    """Of means and of the first layer, in a step counted from 0."""
+    o, layer, schedule = config.optimizer, config.model.layers[0], Schedule.from_config(config)
+    assert isinstance(layer, MLPConfig | PlaneConfig | Hash4DConfig)
+    until = layer.lr_until if isinstance(layer, Hash4DConfig) else 1.0
+    found = {
+        "means": LearningRate(o.means_lr_init, o.means_lr_final, until=o.means_lr_until_fraction),
+        "network": LearningRate(layer.lr_init, layer.lr_final, True, until),
+    }
+    if not isinstance(layer, MLPConfig):
+        found["grids"] = LearningRate(layer.grid_lr_init, layer.grid_lr_final, True, until)
+    return {name: schedule.rate(lr, step) for name, lr in found.items()}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_every_row_has_settings_for_every_scene(name: str) -> None:
+    table = contents(name)
+    for method in table["methods"]:
+        for scene in table["scenes"]:
+            config = published(method["system"], table["dataset"], scene)
+            Schedule.from_config(config)
+            assert any(entry.get("source") for entry in entries(config.run.system, table["dataset"], scene))
+
+
+def test_published_settings_are_of_known_rows_and_scenes() -> None:
+    tables = [contents(name) for name in TABLES]
+    scenes = {table["dataset"]: {*table["scenes"], "Lego"} for table in tables}
+    names = {(method["system"], table["dataset"]) for table in tables for method in table["methods"]}
+    used = {(config.run.system, dataset) for name, dataset in names if (config := config_of(name, "published"))}
+    found = contents("published")
+    assert {(name, dataset) for name, of in found.items() for dataset in of} == used
+    keys = {"source", "steps", "in_steps", "settings", "layer", "differs"}
+    for datasets in found.values():
+        for dataset, entry in datasets.items():
+            assert set(entry) <= keys | {"like", "scenes"}
+            assert set(entry.get("scenes", {})) <= scenes[dataset]
+            assert all(set(of) <= keys for of in entry.get("scenes", {}).values())
+
+
+IMAGES = {"Bouncingballs": 150, "Hellwarrior": 100, "Hook": 100, "Jumpingjacks": 200}
+IMAGES |= {"Lego": 50, "Mutant": 150, "Standup": 150, "Trex": 200}
+
+
+@pytest.mark.parametrize("scene", IMAGES)
+def test_planes_of_dnerf_have_the_published_times(scene: str) -> None:
+    """The rule that dnerf_slim.yaml states, and half the number of images in arguments/dnerf of 4DGaussians."""
+    own = published("hexplane", "D-NeRF", scene).own
+    assert isinstance(own, HexPlaneConfig)
+    assert (own.times, own.first_times) == (int(0.24 * IMAGES[scene]), int(0.12 * IMAGES[scene]))
+    (layer,) = published("4dgs", "D-NeRF", scene).model.layers
+    assert isinstance(layer, PlaneConfig)
+    assert layer.time_resolution == IMAGES[scene] // 2
+
+
+@pytest.mark.parametrize(
+    ("dataset", "system"),
+    [(d, s) for d in ("Neu3D", "HyperNeRF") for s in ("deformgs", "msdgs-mlp", "msdgs-plane") if (d, s) != NO_PLANES],
+)
+def test_the_loop_of_deformable_3d_gaussians_for_real_scenes(dataset: str, system: str) -> None:
+    config = published(system, dataset, "")
+    schedule = Schedule.from_config(config)
+    assert schedule.num_steps == 20_000
+    assert [schedule.deforms(step) for step in (2_998, 2_999)] == [False, True]
+    assert [step for step in range(1, 20_001) if schedule.refines_at(step)] == list(range(600, 15_000, 100))
+    assert [step for step in range(1, 20_001) if schedule.resets_at(step)] == [3_000, 6_000, 9_000, 12_000]
+    noise = [schedule.time_noise(step) for step in (2_998, 5_000, 10_000, 19_999)]
+    assert_close(noise, [0.0, 0.075, 0.05, 0.1 / 20_000], "published.rate")
+    for step in (0, 5_000, 20_000):
+        want = {"means": 8e-4 * 0.01 ** (step / 30_000), "network": 8e-4 * 0.002 ** (step / 40_000)}
+        if system == "msdgs-plane":
+            want["grids"] = 8e-3 * 0.01 ** (step / 40_000)
+        got = rates(config, step)
+        assert_close([got[name] for name in want], [*want.values()], "published.rate.relative")
+    for layer in config.model.layers:
+        assert isinstance(layer, PlaneConfig | MLPConfig)
+        if isinstance(layer, MLPConfig):
+            assert (layer.time_network, layer.time_frequencies) == (False, 10)
+    assert published(system, "D-NeRF", "Hook").curriculum.time_noise == 0
+
+
+@pytest.mark.parametrize(
+    ("dataset", "scene", "batch_size", "multires", "times"),
+    [
+        ("HyperNeRF", "Broom", 2, (1, 2, 4), 100),
+        ("HyperNeRF", "3DPrinter", 2, (1, 2, 4), 100),
+        ("HyperNeRF", "Chicken", 2, (1, 2, 4), 80),
+        ("HyperNeRF", "Peel Banana", 2, (1, 2, 4), 250),
+        ("Neu3D", "Coffee Martini", 4, (1, 2), 150),
+        ("Neu3D", "Cook Spinach", 2, (1, 2), 150),
+        ("Neu3D", "Flame Salmon", 4, (1, 2), 150),
+    ],
+)
+def test_4dgaussians_on_real_scenes(
+    dataset: str, scene: str, batch_size: int, multires: tuple[int, ...], times: int
+) -> None:
+    config = published("4dgs", dataset, scene)
+    schedule, model = Schedule.from_config(config), config.model
+    assert (schedule.num_steps, schedule.restart_step, config.run.batch_size) == (17_000, 3_000, batch_size)
+    rounds = [step for step in range(1, 17_001) if schedule.refines_at(step)]
+    assert rounds == [*range(600, 3_001, 100), *range(3_600, 13_000, 100)]
+    assert not any(schedule.resets_at(step) for step in range(1, 17_001))
+    (layer,) = model.layers
+    assert isinstance(layer, PlaneConfig)
+    assert (layer.features, layer.width, layer.multires, layer.time_resolution) == (16, 128, multires, times)
+    assert (model.opacity_head, model.sh_head) == (dataset == "Neu3D",) * 2
+    for step in (0, 3_000, 10_000, 16_999):
+        part = (step if step < 3_000 else step - 3_000) / 20_000
+        want = {"means": 8e-4 * 0.01**part, "network": 8e-4 * 0.1**part, "grids": 8e-3 * 0.1**part}
+        got = rates(config, step)
+        assert_close([got[name] for name in want], [*want.values()], "published.rate.relative")
+
+
+@pytest.mark.parametrize(
+    ("dataset", "scene", "steps", "warm_up", "bound", "finest", "every", "noise", "decays"),
+    [  # decays in steps: means, network and grids
+        ("D-NeRF", "Hook", 50_000, 3_000, None, (32, 32, 16), (100, 3_000), 1e-2 / 3.2, (35_000, 45_000)),
+        ("HyperNeRF", "Broom", 30_000, 1, 0.8, (256, 256, 64), (100, 3_000), 1e-2 / 1.6, (30_000, 30_000)),
+        ("HyperNeRF", "3DPrinter", 40_000, 1_000, 1.0, (512, 512, 32), (100, 3_000), 1e-2 / 2, (35_000, 40_000)),
+        ("HyperNeRF", "Chicken", 40_000, 1_000, 1.6, (512, 512, 32), (100, 1_000), 1e-2 / 3.2, (25_000, 25_000)),
+        ("HyperNeRF", "Peel Banana", 30_000, 1, 1.0, (256, 256, 256), (100, 1_000), 1e-2 / 2, (25_000, 30_000)),
+        ("Neu3D", "Coffee Martini", 50_000, 3_000, 30.0, (64, 64, 128), (400, 6_000), None, (35_000, 45_000)),
+        ("Neu3D", "Flame Salmon", 50_000, 3_000, 30.0, (64, 64, 128), (400, 6_000), None, (35_000, 45_000)),
+        ("Neu3D", "Sear Steak", 20_000, 3_000, 30.0, (512, 512, 128), (400, 6_000), 5e-3 / 60, (35_000, 45_000)),
+    ],
+)
+def test_grid4d_by_scene(
+    dataset: str,
+    scene: str,
+    steps: int,
+    warm_up: int,
+    bound: float | None,
+    finest: tuple[int, ...],
+    every: tuple[int, int],
+    noise: float | None,
+    decays: tuple[int, int],
+) -> None:
+    config = published("grid4d", dataset, scene)
+    schedule, (layer,) = Schedule.from_config(config), config.model.layers
+    assert isinstance(layer, Hash4DConfig)
+    assert (schedule.num_steps, schedule.deform_start_step) == (steps, warm_up - 1)
+    assert (config.data.scene_half_size, layer.finest) == (bound, finest)
+    assert (schedule.refine_every, schedule.reset_every) == every
+    assert (layer.depth, layer.displaced < 1) == (int(dataset == "HyperNeRF"), dataset == "D-NeRF")
+    assert (config.loss.ssim_lambda == 0) == (layer.temporal_weight == 0) == (noise is None)
+    if noise:
+        assert_close(layer.temporal_noise, noise, "published.rate.relative")
+    for step in (0, 10_000, steps):
+        means, network = (min(step / of, 1) for of in decays)
+        grid = 1.6e-3 if scene == "Peel Banana" else 8e-3
+        want = {
+            "means": 8e-4 * 0.01**means,
+            "network": (8e-4 * 0.002**network if dataset == "D-NeRF" else 1.6e-4 * 0.01**network),
+            "grids": grid * 0.01**network,
+        }
+        got = rates(config, step)
+        assert_close([got[name] for name in want], [*want.values()], "published.rate.relative")
+
+
+def test_grid4d_on_lego_is_as_docs_say() -> None:
+    (layer,) = published("grid4d", "D-NeRF", "Lego").model.layers
+    shown = re.search("`--layers (.*)`", (ROOT / "docs" / "migration.md").read_text(encoding="utf-8"))
+    assert shown is not None
+    assert from_plain("layers", shown[1], LAYERS) == layer
 
 
 @pytest.mark.parametrize("variant", ["published", "small"])

@@ -92,6 +92,21 @@ def test_layer_agrees_with_a_plain_reading(sizes: dict[str, int]):
         assert_close(got.detach(), want, "network.float64")
 
 
+@pytest.mark.parametrize("initialization", ["local", "torch"])
+def test_without_a_network_of_time_its_encoding_is_read(initialization: str):
+    layer = MLPLayer(MLPConfig(width=16, depth=3, skip=1, time_network=False, initialization=initialization))
+    t = torch.tensor(0.7)
+    encoded = positional_encoding(t.reshape(1, 1), layer.time_frequency_matrix)
+    assert torch.equal(layer.time_output(layer.time_hidden(encoded).relu()), encoded)
+    assert layer.first.in_features == 63 + 13
+    (group,) = layer.parameter_groups()
+    trained = sum(p.numel() for p in group.params)
+    assert trained == (63 + 13 + 1) * 16 + (63 + 13 + 16 + 1) * 16 + 17 * 16 + 17 * 11
+    layer(torch.randn(5, 3), t).delta_means.sum().backward()
+    assert all(p.grad is not None for p in group.params)
+    assert layer.time_hidden.weight.grad is layer.time_output.weight.grad is None
+
+
 def test_heads_of_opacity_and_sh_change_only_these():
     torch.manual_seed(4)
     layer = MLPLayer(MLPConfig(width=16, depth=2), Heads(opacity=True, sh=4)).double()
