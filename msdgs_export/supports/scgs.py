@@ -55,7 +55,7 @@ class SCGSExport(SupportExport):
 def _motions(graph: GraphBuilder, inputs: SupportInputs) -> str:
     """[M, 19] `SCGSSupport.motions`, but matrices column by column."""
     support = cast(SCGSSupport, inputs.support)
-    if not support.is_placed:
+    if not support.has_nodes:
         raise ModelNotExportable("the control nodes of this model aren't placed: train it past its first stage")
     positions, used = to_numpy(support.nodes), [*HEADS, LOCAL_QUATS]
     nodes, constants = graph.constant("nodes", positions), stored_constants(graph, inputs.layers, positions)

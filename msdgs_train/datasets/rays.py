@@ -77,14 +77,13 @@ class RayBatches:
         each_pass = len(self._places) // self._size
         order = self._order(number // each_pass, seed)
         first = number % each_pass * self._size
-        chosen = order[first : first + self._size].to(self._places.device, torch.int64)
+        chosen = order[first : first + self._size].to(torch.int64)
         views = torch.searchsorted(self._ends, chosen, right=True)
         return RayBatch(self._views.rays(views, self._places[chosen]), self._rgba[chosen])
 
     def _shuffled(self, number: int, seed: int) -> Tensor:
-        return torch.from_numpy(
-            np.random.default_rng((seed, number)).permutation(np.arange(len(self._places), dtype=np.int32))
-        )
+        order = np.random.default_rng((seed, number)).permutation(np.arange(len(self._places), dtype=np.int32))
+        return torch.from_numpy(order).to(self._places.device)
 
 
 def _pixels(frame: Frame, device: str, hits: Callable[[Rays], Tensor] | None) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.layers import arrays
 from msdgs_train.layers.base import DeformationLayer, LayerConfig, check_size
-from msdgs_train.layers.quaternions import multiply, unit
+from msdgs_train.layers.quaternions import conjugate, multiply, unit
 
 NUM_KNOTS, MAX_KNOTS = 36, 120
 """Limits of the intervals that follow the captured times."""
@@ -100,9 +100,10 @@ class CurveLayer(DeformationLayer):
         for curve in self.held_curves:
             curve[:first], curve[last + 1 :] = curve[first], curve[last]
         # of both ends at once, [2, C, 3] and [2 C, 4]
-        transls, shifts = self.transls[[first, last]], self._speeds(first, last)
-        rots, inner = (unit(self.rots[ends].flatten(0, 1)) for ends in ([first, last], [first + 1, last - 1]))
-        turns = multiply(rots, inner * rots.new_tensor([1.0, -1.0, -1.0, -1.0]))
+        transls, shifts = torch.stack([self.transls[first], self.transls[last]]), self._speeds(first, last)
+        ends = (first, last), (first + 1, last - 1)
+        rots, inner = (unit(torch.cat([self.rots[a], self.rots[b]])) for a, b in ends)
+        turns = multiply(rots, conjugate(inner))
         for farther in range(3):  # knots that times within the window read; those farther away are as the third
             transls, rots = transls + shifts, unit(multiply(turns, rots))
             for end, beyond in enumerate((slice(0, max(first - farther, 0)), slice(last + 1 + farther, None))):
@@ -114,7 +115,8 @@ class CurveLayer(DeformationLayer):
         intervals next to these, since the outermost knots have been trained least. 0 while there are too few knots."""
         if last - first < 4:
             return torch.zeros_like(self.transls[:2])
-        return (self.transls[[first + 1, last - 1]] - self.transls[[first + 3, last - 3]]) / 2
+        starts, ends = self.transls[first + 1] - self.transls[first + 3], self.transls[last - 1] - self.transls[last - 3]
+        return torch.stack([starts, ends]) / 2
 
 
 def cubic_weights(part: Tensor) -> Tensor:

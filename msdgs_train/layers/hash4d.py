@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.base import (
     PAPER_HEADS,
     DeformationLayer,
@@ -180,7 +181,9 @@ class Hash4DLayer(DeformationLayer):
     def temporal_features(self, places: Tensor) -> Tensor:
         """[N, 3 · L · C] features of the grids over x y t, y z t and x z t at places, [N, 4]."""
         pairs = zip(self.temporal, AXES, strict=True)
-        return torch.cat([grid(places[:, [*axes, 3]]) for grid, axes in pairs], dim=1)
+        columns = places.unbind(dim=1)
+        read = [grid(torch.stack([columns[a], columns[b], columns[3]], dim=1)) for grid, (a, b) in pairs]
+        return torch.cat(read, dim=1)
 
     def parameter_groups(self) -> list[ParamGroup]:
         c, tables = self.config, [grid.get_parameter("table") for grid in (self.canonical, *self.temporal)]
@@ -203,10 +206,11 @@ class Hash4DLayer(DeformationLayer):
         for name, weight, noise, features in kinds:
             if weight and len(places):
                 count = max(1, int(c.displaced * len(places)))
-                chosen = torch.randperm(len(places), generator=generator)[:count].to(places.device)
-                moves = 2 * torch.rand(count, len(noise), generator=generator) - 1
+                chosen = to_device(torch.randperm(len(places), generator=generator)[:count], places.device)
+                moves = (2 * torch.rand(count, len(noise), generator=generator) - 1).to(places.dtype)
+                moves = to_device(moves * torch.tensor(noise, dtype=places.dtype), places.device)
                 before = places[chosen, : len(noise)]
-                after = before + moves.to(before) * before.new_tensor(noise)
+                after = before + moves
                 change = features(after) - features(before)
                 terms[name] = weight * change.square().sum(dim=1).mean()
         return terms

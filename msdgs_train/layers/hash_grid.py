@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from msdgs_serve.threads import run_parallel, split_evenly
+from msdgs_train.layers import arrays
 from msdgs_train.layers.arrays import to_array
 from msdgs_train.layers.hash_kernels import CORNERS, PRIMES, UINT32, Levels, hash_features, hash_gradients, hash_slopes
 
@@ -36,7 +37,7 @@ class HashGrid(nn.Module):
 
     def forward(self, positions: Tensor) -> Tensor:
         """[N, L · C], level by level, at positions [N, 3]."""
-        if positions.device.type == "cpu":
+        if arrays.has_kernels(positions):
             return _HashFeatures.apply(self.table, positions, self.levels)
         return self.in_torch(positions)
 

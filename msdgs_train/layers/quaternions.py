@@ -55,6 +55,11 @@ class _Unit(torch.autograd.Function):
         return torch.from_numpy(grad_raw).to(grad.device)
 
 
+def conjugate(quats: Tensor) -> Tensor:
+    """The inverses of unit quaternions."""
+    return torch.cat([quats[:, :1], -quats[:, 1:]], dim=1)
+
+
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton products: first b rotates, then a."""
     (aw, av), (bw, bv) = (q.split((1, 3), dim=1) for q in (a, b))

@@ -24,7 +24,7 @@ from msdgs_train.layers.base import check_size
 from msdgs_train.layers.chain import Deltas, MultiStepDeformation
 from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.layers.placement import farthest_points
-from msdgs_train.layers.quaternions import rotation_matrices, unit
+from msdgs_train.layers.quaternions import identity_like, rotation_matrices, unit
 from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
 from msdgs_train.supports.nearest import nearest
 from msdgs_train.supports.skinning import check_nodes
@@ -87,7 +87,7 @@ class NodeRows(NamedTuple):
 
 
 class SCGSSupport(Support):
-    """The points are the Gaussians until `is_placed`, then control nodes."""
+    """The points are the Gaussians until the nodes are placed, then the nodes."""
 
     kind = "scgs"
     nodes: nn.Parameter
@@ -102,6 +102,13 @@ class SCGSSupport(Support):
         m = config.num_nodes
         self.set_rows(NodeRows(torch.zeros(m, 3), torch.zeros(m, config.hyper_dim), torch.zeros(m), torch.zeros(m)))
         self.register_buffer("is_placed", torch.tensor(False))
+        self.has_nodes = False  # as `is_placed`, but read without waiting for a device
+        self.register_load_state_dict_post_hook(_read_is_placed)
+
+    def set_placed(self, is_placed: bool) -> None:
+        """Whether the nodes are placed, and Gaussians follow them."""
+        self.is_placed.fill_(is_placed)
+        self.has_nodes = is_placed
 
     def set_rows(self, rows: NodeRows) -> None:
         """Replace all nodes; their number may change."""
@@ -138,10 +145,10 @@ class SCGSSupport(Support):
         self, chain: MultiStepDeformation, means: Tensor, t: Tensor, num_layers: int | None = None
     ) -> Tensor | Deltas:
         deltas = chain(self.points(means), t, num_layers)
-        return self.transforms(deltas) if self.is_placed else deltas
+        return self.transforms(deltas) if self.has_nodes else deltas
 
     def points(self, means: Tensor) -> Tensor:
-        return self.nodes if self.is_placed else means.detach()
+        return self.nodes if self.has_nodes else means.detach()
 
     def transforms(self, deltas: Deltas) -> Tensor:
         """[M, 19] matrices, offsets, deltas of scales and of quaternions of the nodes: x → matrix x + offset, which is
@@ -220,4 +227,10 @@ class SCGSSupport(Support):
 
 def _local_quats(deltas: Deltas) -> Tensor:
     """[M, 4] rotations about the nodes, not normalized."""
-    return deltas.extra[LOCAL_QUATS] + deltas.means.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return deltas.extra[LOCAL_QUATS] + identity_like(deltas.means)
+
+
+def _read_is_placed(support: nn.Module, _: object) -> None:
+    """After its state is loaded."""
+    assert isinstance(support, SCGSSupport)
+    support.has_nodes = bool(support.is_placed)

@@ -17,6 +17,7 @@ from torch.nn import functional
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import SceneData
 from msdgs_train.datasets.rays import Rays
+from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.volumes.config import VolumeConfig
 from msdgs_train.volumes.field import Change, RayField, encoded
@@ -125,14 +126,14 @@ class HexPlane(RayField):
     def samples(self, rays: Rays, generator: torch.Generator | None) -> Samples:
         distances = self._distances(rays.origins.device)
         if generator is not None:  # all rays alike
-            shift = torch.rand(len(distances), generator=generator).to(distances.device)
+            shift = to_device(torch.rand(len(distances), generator=generator), distances.device)
             distances = distances + shift * ((self.config.far - self.config.near) / len(distances))
         directions = functional.normalize(rays.directions, dim=1)
         points = rays.origins[:, None] + directions[:, None] * distances[:, None]
-        inside = self.box.contains(points)
-        if self.cells is not None:
-            inside[inside.clone()] = in_occupied(self.cells, self.box.normalized(points[inside]))
-        return Samples.of(points, functional.pad(distances.diff(), (0, 1)), inside)
+        samples = Samples.of(points, functional.pad(distances.diff(), (0, 1)), self.box.contains(points))
+        if self.cells is None:
+            return samples
+        return samples.at(torch.nonzero(in_occupied(self.cells, self.box.normalized(samples.points)))[:, 0])
 
     def _distances(self, device: torch.device) -> Tensor:
         count = int(3**0.5 * self.resolution / STEP)
@@ -221,7 +222,7 @@ def _resize(planes: nn.ParameterList, size: tuple[int, int]) -> None:
 def _products(space: nn.ParameterList, time: nn.ParameterList, points: Tensor, times: Tensor) -> Iterator[Tensor]:
     """Features, [C, M], of each plane in space times its plane over time, at points, [M, 3], and times, [M]."""
     for (u, v, w), in_space, over_time in zip(AXES, space, time, strict=True):
-        places = points[:, [u, v]], torch.stack([times, points[:, w]], dim=1)
+        places = torch.stack([points[:, u], points[:, v]], dim=1), torch.stack([times, points[:, w]], dim=1)
         at, then = (
             functional.grid_sample(plane, place[None, :, None], align_corners=True)[0, :, :, 0]
             for plane, place in zip((in_space, over_time), places, strict=True)

@@ -34,11 +34,11 @@ def march(field: RayField, rays: Rays, background: Tensor, generator: torch.Gene
     samples = field.samples(rays, generator)
     depths, features = field.optical_depths(samples, rays)
     if field.least_depth:
-        kept = depths > field.least_depth
-        samples, depths, features = samples.where(kept), depths[kept], features[kept]
+        kept = torch.nonzero(depths > field.least_depth)[:, 0]
+        samples, depths, features = samples.at(kept), depths[kept], features[kept]
     weights, left = weigh(depths, samples, len(rays.times), field.stop)
-    seen = weights > field.least_weight
-    samples, weights = samples.where(seen), weights[seen]
+    seen = torch.nonzero(weights > field.least_weight)[:, 0]
+    samples, weights = samples.at(seen), weights[seen]
     colors = field.colors(samples, rays, features[seen])
     rgb = left[:, None] * background
     rgb = rgb.index_add(0, samples.rays, weights[:, None] * colors)

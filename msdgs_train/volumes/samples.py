@@ -20,9 +20,9 @@ class Samples(NamedTuple):
         rays, steps = torch.nonzero(inside, as_tuple=True)
         return cls(points[rays, steps], rays, steps, lengths[steps])
 
-    def where(self, chosen: Tensor) -> "Samples":
-        """Those that `chosen`, [M] bool, names."""
-        return Samples(*(tensor[chosen] for tensor in self))
+    def at(self, places: Tensor) -> "Samples":
+        """Those at `places`, int64, in this order."""
+        return Samples(*(tensor[places] for tensor in self))
 
 
 class Marched(NamedTuple):

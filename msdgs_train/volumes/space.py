@@ -45,6 +45,6 @@ def occupied_cells(alphas: Tensor, least: float) -> Tensor:
 
 def in_occupied(cells: Tensor, normalized: Tensor) -> Tensor:
     """Whether points of the box, [M, 3] in [-1, 1], are in cells, [X, Y, Z] bool, that may hold something."""
-    counts = torch.tensor(cells.shape, device=cells.device)
-    x, y, z = torch.minimum(((normalized + 1) * (counts / 2)).long().clamp(min=0), counts - 1).unbind(dim=1)
-    return cells.view(-1)[(x * counts[1] + y) * counts[2] + z]
+    columns = zip(normalized.unbind(dim=1), cells.shape, strict=True)
+    x, y, z = (((column + 1) * (count / 2)).long().clamp(0, count - 1) for column, count in columns)
+    return cells[x, y, z]

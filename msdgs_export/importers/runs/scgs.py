@@ -94,4 +94,4 @@ def fill_model(model: DynamicGaussians, state: State) -> None:
     stored = NodeRows(nodes[:, :3], nodes[:, 3:], state.read("_node_radius", m), logits[:, 0])
     for name, values in stored._asdict().items():
         support.get_parameter(name).copy_(values)
-    support.is_placed.fill_(True)
+    support.set_placed(True)

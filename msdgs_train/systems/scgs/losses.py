@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.chain import MultiStepDeformation
 from msdgs_train.supports.nearest import nearest
 
@@ -54,7 +55,7 @@ def rigidity_loss(positions: Tensor, generator: torch.Generator) -> Tensor:
     is_near[:, :ALWAYS_RIGID] = True
     rows = torch.arange(len(first), device=first.device)
     if len(first) > RIGID_SAMPLES:
-        rows = torch.randint(len(first), (RIGID_SAMPLES,), generator=generator).to(first.device)
+        rows = to_device(torch.randint(len(first), (RIGID_SAMPLES,), generator=generator), first.device)
     edges = is_near[rows, :, None] * (positions[:, rows, None] - positions[:, ids[rows]])  # [T, M, K, 3]
     total = positions.new_zeros(())
     for later in edges[1:]:

@@ -17,6 +17,7 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians, PosedGaussians, canonical_points
 from msdgs_train.gaussians.scale_space import activated_scales
 from msdgs_train.gaussians.surgery import MOMENTS, RowSurgery
+from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.mlp import MLPLayer
 from msdgs_train.layers.parameters import ParamGroup, constant
 from msdgs_train.layers.placement import farthest_points
@@ -79,7 +80,7 @@ class SCGS(GaussianSplatting):
     @property
     def is_second(self) -> bool:
         """Whether the second stage has begun."""
-        return bool(self.support.is_placed)
+        return self.support.has_nodes
 
     def _local(self, step: int) -> int:
         """A step of the run, counted from the start of the stage."""
@@ -135,7 +136,7 @@ class SCGS(GaussianSplatting):
     def _begin_second(self, optimizer: torch.optim.Optimizer) -> None:
         """Nodes are where the Gaussians that are left have come to; new Gaussians follow them."""
         self.support.nodes.copy_(self.model.gaussians.means)
-        self.support.is_placed.fill_(True)
+        self.support.set_placed(True)
         none = torch.zeros(0, dtype=torch.int64, device=self.support.nodes.device)
         fresh = self.new_gaussians().to(self.config.run.device)
         self._replace_gaussians(optimizer, none, dict(fresh.named_parameters()))
@@ -163,7 +164,7 @@ class SCGS(GaussianSplatting):
     def loss(self, frame: Frame, target: Target, background: Tensor, moment: Moment) -> ViewLoss:
         moment = moment._replace(step=self._local(moment.step))
         if not self.is_second:  # a random background shows what should be empty
-            drawn = torch.rand(3, generator=moment.generator).to(background)
+            drawn = to_device(torch.rand(3, generator=moment.generator), background.device)
             clear = 1 - target.alpha[..., None] * (1 / 255)
             target = target._replace(rgb=target.rgb + clear * (drawn - background))
             background = drawn
@@ -201,7 +202,7 @@ class SCGS(GaussianSplatting):
     def _positions(self, times: Tensor) -> Tensor:
         """[T, M, 3] of the nodes."""
         nodes = self.support.nodes
-        return trajectories(self.model.deformation, nodes, times.to(nodes))
+        return trajectories(self.model.deformation, nodes, to_device(times.to(nodes.dtype), nodes.device))
 
     @torch.no_grad()
     def after_step(self, optimizer: torch.optim.Optimizer, steps: range, views: list[tuple[Frame, ViewLoss]]) -> None:
@@ -229,7 +230,7 @@ class SCGS(GaussianSplatting):
     def load_state(self, state: dict[str, Any], step: int) -> None:
         stored = NodeRows(*(state["model"][f"support.{name}"] for name in NodeRows._fields))
         self.support.set_rows(NodeRows(*(rows.to(self.support.nodes) for rows in stored)))
-        self.support.is_placed.copy_(state["model"]["support.is_placed"])
+        self.support.set_placed(bool(state["model"]["support.is_placed"]))
         self.step = step
         self._enter()
         super().load_state(state, self._local(step))

@@ -131,7 +131,7 @@ def test_weights_as_in_a_loop(stop: float) -> None:
             assert_close(float(weights[index]), seen * alpha, "volume.forward")
             seen *= 1 - alpha
         assert_close(float(left[ray]), seen, "volume.forward")
-    empty = samples.where(torch.zeros(len(samples.rays), dtype=torch.bool))
+    empty = samples.at(torch.zeros(0, dtype=torch.int64))
     assert weigh(depths[:0], empty, 6, stop)[1].tolist() == [1.0] * 6
 
 
