@@ -49,7 +49,7 @@ def _update_places(group: dict[str, Any], parameter: Tensor, gradient: Tensor, s
 def _update_all(
     group: dict[str, Any], parameter: Tensor, gradient: Tensor, state: dict[str, Tensor], broken: Tensor | None
 ) -> None:
-    """As `_update_places`, on a device that the CPU doesn't wait for; nothing changes where `broken`, a scalar, is 1."""
+    """As `_update_places`, without waiting for a device; nothing changes if `broken`, a scalar, is 1."""
     seen = gradient != 0
     if broken is not None:
         seen &= broken == 0

@@ -115,8 +115,8 @@ class CurveLayer(DeformationLayer):
         intervals next to these, since the outermost knots have been trained least. 0 while there are too few knots."""
         if last - first < 4:
             return torch.zeros_like(self.transls[:2])
-        starts, ends = self.transls[first + 1] - self.transls[first + 3], self.transls[last - 1] - self.transls[last - 3]
-        return torch.stack([starts, ends]) / 2
+        t = self.transls
+        return torch.stack([t[first + 1] - t[first + 3], t[last - 1] - t[last - 3]]) / 2
 
 
 def cubic_weights(part: Tensor) -> Tensor:

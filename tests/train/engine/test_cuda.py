@@ -27,13 +27,19 @@ needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch find
 GAUSSIANS, CAMERA = random_scene(0, 400, 96, 64)
 
 
-def drawn(device: str, weights: Tensor) -> dict[str, np.ndarray]:
+def drawn(device: str, weights: Tensor, raw_quats: bool) -> dict[str, np.ndarray]:
     """Image, alpha, and gradients of a weighted sum of both."""
     arrays = {name: getattr(GAUSSIANS, name) for name in FIELDS}
     tensors = {name: torch.tensor(array, device=device, requires_grad=True) for name, array in arrays.items()}
     parameters = PosedGaussians(**tensors)
-    posed = parameters._replace(quats=torch.nn.functional.normalize(parameters.quats, dim=1))
-    rgb, alpha, info = rasterize(*posed, CAMERA, torch.tensor([0.2, 0.6, 0.9], device=device))
+    units = torch.nn.functional.normalize(parameters.quats, dim=1)
+    posed = parameters._replace(quats=torch.linspace(0.7, 1.3, len(units), device=device)[:, None] * units)
+    rgb, alpha, info = rasterize(
+        *(posed if raw_quats else posed._replace(quats=units)),
+        CAMERA,
+        torch.tensor([0.2, 0.6, 0.9], device=device),
+        raw_quats=raw_quats,
+    )
     values = torch.cat([rgb, alpha[:, :, None]], dim=2)
     grads = torch.autograd.grad((values * weights.to(device)).sum(), parameters)
     assert info.means2d_grads is not None
@@ -43,9 +49,10 @@ def drawn(device: str, weights: Tensor) -> dict[str, np.ndarray]:
 
 
 @needs_gpu
-def test_gpu_and_cpu_draw_the_same_image_and_gradients() -> None:
+@pytest.mark.parametrize("raw_quats", [False, True], ids=["unit", "raw"])
+def test_gpu_and_cpu_draw_the_same_image_and_gradients(raw_quats: bool) -> None:
     weights = torch.randn(CAMERA.height, CAMERA.width, 4, generator=torch.Generator().manual_seed(0))
-    on_cpu, on_gpu = drawn("cpu", weights), drawn("cuda", weights)
+    on_cpu, on_gpu = drawn("cpu", weights, raw_quats), drawn("cuda", weights, raw_quats)
     for name in ("rgb", "alpha"):
         assert_close(on_gpu.pop(name), on_cpu.pop(name), "cuda.pixel")
     for name, expected in on_cpu.items():

@@ -13,9 +13,10 @@ from msdgs_train.gaussians.raw_quaternions import unit_form
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.supports.nodes import NodesConfig
 from tests.support.models import random_model
-from tests.support.scenes import front_camera
-from tests.support.tolerances import tolerance
+from tests.support.scenes import FIELDS, front_camera, random_scene
+from tests.support.tolerances import assert_close, tolerance
 from tests.support.training_scene import MLP
+from tests.support.without_kernels import switch_kernels_off
 
 
 def covariances(quats: Tensor, scales: Tensor) -> np.ndarray:
@@ -65,6 +66,36 @@ def test_training_and_evaluation_draw_the_same() -> None:
     model.config = scaled
     other = rasterize(*model.pose(0.4), camera, torch.zeros(3).double())[0].detach()
     assert float((other - frames[0]).abs().max()) > 0.01, "lengths matter"
+
+
+@pytest.mark.parametrize("stretch", [0.0, 1.0], ids=["balls", "ellipsoids"])
+@pytest.mark.parametrize("absolute", [False, True], ids=["sums", "absolute"])
+def test_a_gpu_draws_them_by_covariances(stretch: float, absolute: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same image as the kernels, and the same gradients."""
+    gaussians, camera = random_scene(0, 200)
+    given = {name: torch.from_numpy(getattr(gaussians, name)) for name in FIELDS}
+    given["scales"] = 0.1 * (given["scales"] / 0.1) ** stretch
+    given["quats"] = torch.linspace(0.7, 1.3, len(given["quats"]))[:, None] * given["quats"]
+    weights = torch.randn(camera.height, camera.width, 4, generator=torch.Generator().manual_seed(0))
+
+    def drawn() -> dict[str, Tensor]:
+        leaves = {name: tensor.clone().requires_grad_() for name, tensor in given.items()}
+        how = {"absolute_gradients": absolute, "raw_quats": True}
+        rgb, alpha, info = rasterize(*leaves.values(), camera, torch.tensor([0.2, 0.6, 0.9]), **how)
+        (torch.cat([rgb, alpha[..., None]], dim=2) * weights).sum().backward()
+        assert info.means2d_grads is not None
+        found = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
+        return found | {"means2d": info.means2d_grads, "rgb": rgb.detach(), "alpha": alpha.detach()}
+
+    want = drawn()
+    switch_kernels_off(monkeypatch)
+    got = drawn()
+    assert got.keys() == want.keys() == {*FIELDS, "means2d", "rgb", "alpha"}
+    for name in ("rgb", "alpha"):
+        assert_close(got.pop(name).numpy(), want.pop(name).numpy(), f"{name}.float32")
+    for name, gradients in want.items():
+        error = float((got[name] - gradients).abs().max() / gradients.abs().max())
+        assert error <= tolerance("gradient.float32"), name
 
 
 def test_nodes_have_unit_quaternions() -> None:
