@@ -47,6 +47,12 @@ MLP = MLPConfig(width=16, depth=2, xyz_frequencies=3, time_frequencies=2, time_w
 PLANE = PlaneConfig(features=4, resolution=6, time_resolution=5, width=8)
 TINY_GRIDS: dict[str, Any] = {"levels": 3, "log2_rows": 8, "canonical_levels": 3, "canonical_log2_rows": 8, "width": 8}
 """Sizes of a hash layer."""
+VOLUMES: dict[str, dict[str, Any]] = {
+    "hexplane-slim": {"voxels": 12**3, "first_voxels": 8**3, "times": 4, "first_times": 3},
+    "tineuvox-s": {"voxels": 16**3, "width": 8},
+    "tineuvox-b": {"voxels": 16**3, "width": 8, "channels": 3},
+}
+"""Sizes of volumes, by preset."""
 BODIES = BodiesConfig(num_knots=8, num_bodies=3)
 HASH4D = Hash4DConfig(**TINY_GRIDS, depth=1)
 SMALL_MODEL = ModelConfig(sh_degree=1, layers=(MLP, MLP), embedding_dim=4)

@@ -4,6 +4,7 @@ The stand-in draws with the project's own kernels. It has gsplat's arguments, an
 them.
 """
 
+import sys
 import traceback
 from typing import Any, Self
 
@@ -30,15 +31,16 @@ from msdgs_train.rendering.rasterize import _Rasterize
 
 READS = {"_local_scalar_dense", "nonzero", "masked_select", "is_nonzero", "equal", "_linalg_svd"}
 """Operations whose results the CPU reads; of a decomposition, whether it has converged."""
+TRAINER = "/msdgs_train/"
 
 
 class NoReads(TorchDispatchMode):
-    """Refuses operations for which the CPU would wait for a GPU, unless one of the `exempt` files of the trainer calls
+    """Refuses operations for which the CPU would wait for a GPU, but `allowed` ones, with the trainer's files that call
     them. Tensors that a generator drew, and what is computed of them alone, are on the CPU in any case."""
 
-    def __init__(self, *exempt: str) -> None:
+    def __init__(self, *allowed: tuple[str, str]) -> None:
         super().__init__()
-        self._exempt, self._copies = exempt, _NoCopies(exempt)
+        self._allowed, self._copies = allowed, _NoCopies()
         self._on_cpu = WeakTensorKeyDictionary()
 
     def __enter__(self) -> Self:
@@ -61,7 +63,7 @@ class NoReads(TorchDispatchMode):
             for each in arg
         )
         if (name in READS or by_mask) and not on_cpu:
-            _refuse(func, self._exempt)
+            _refuse(name, self._allowed)
         result = func(*args, **kwargs)
         if on_cpu or kwargs.get("generator") is not None:
             for each in tree_leaves(result):
@@ -73,10 +75,6 @@ class NoReads(TorchDispatchMode):
 class _NoCopies(TorchFunctionMode):
     """Refuses copies to a device of what is on the CPU, lists of indices among it; `arrays.to_device` doesn't wait."""
 
-    def __init__(self, exempt: tuple[str, ...]) -> None:
-        super().__init__()
-        self._exempt = exempt
-
     def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs, name = kwargs or {}, getattr(func, "__name__", "")
         if name == "to":
@@ -86,17 +84,17 @@ class _NoCopies(TorchFunctionMode):
             copies = any(isinstance(each, list) for each in (index if isinstance(index, tuple) else (index,)))
         else:
             copies = name == "new_tensor" or (name in ("tensor", "as_tensor") and kwargs.get("device") is not None)
-        if copies:
-            _refuse(func, self._exempt)
+        if copies and TRAINER in sys._getframe(1).f_code.co_filename:  # torch itself moves nothing
+            _refuse(name)
         return func(*args, **kwargs)
 
 
-def _refuse(func: Any, exempt: tuple[str, ...]) -> None:
-    """Raise, unless the innermost file of the trainer is exempt."""
+def _refuse(name: str, allowed: tuple[tuple[str, str], ...] = ()) -> None:
+    """Raise, unless the innermost file of the trainer may call it."""
     files = (frame.filename for frame in reversed(traceback.extract_stack()))
-    caller = next((file for file in files if "/msdgs_train/" in file), "")
-    if not caller.endswith(exempt):
-        raise AssertionError(f"{func} makes the CPU wait for the device, called by {caller}")
+    caller = next((file for file in files if TRAINER in file), "")
+    if not any(caller.endswith(file) and name == operation for file, operation in allowed):
+        raise AssertionError(f"{name} makes the CPU wait for the device, called by {caller}")
 
 
 class _Draw(torch.autograd.Function):

@@ -3,23 +3,30 @@
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import nn
 
+from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene import InvalidInput
 from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.masked_adam import MaskedAdam
 from msdgs_train.engine.meters import MAX_SKIPPED_IN_A_ROW, DeviceMeter, Observed, StepMeter, TrainingDiverged
 from msdgs_train.engine.run import fit
 from msdgs_train.engine.trainer import Trainer
+from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers import arrays
+from msdgs_train.systems.registry import preset, systems
+from msdgs_train.systems.scgs import losses
+from msdgs_train.systems.scgs.settings import SCGSSettings
 from msdgs_train.systems.targets import Target, TrainingImage, TrainingImages
 from tests.support.tolerances import assert_close, tolerance
-from tests.support.training_scene import MODELS, SIZE, StopAfter, small_config, splatting
+from tests.support.training_scene import MODELS, SIZE, VOLUMES, StopAfter, shrunk, small_config, splatting, trained
 from tests.support.without_kernels import NoReads, switch_kernels_off
 
 ALL_PARTS = {
@@ -33,6 +40,20 @@ ALL_PARTS = {
     "mcmc": {"model": MODELS["mlp"], "density_strategy": "mcmc"},
 }
 IMAGE_BYTES = 4 * SIZE * SIZE
+MARCHED = (
+    ("volumes/samples.py", "nonzero"),
+    ("volumes/march.py", "nonzero"),
+    ("volumes/march.py", "_local_scalar_dense"),
+)
+TINEUVOX = (*MARCHED, ("volumes/tineuvox.py", "_local_scalar_dense"))
+ROTATIONS = (("scgs/losses.py", "_linalg_svd"),)
+READ = {
+    "hexplane-slim": (*MARCHED, ("volumes/hexplane.py", "nonzero")), "tineuvox-s": TINEUVOX, "tineuvox-b": TINEUVOX,
+    "sc-gs": ROTATIONS, "sc-gs-small": ROTATIONS,
+}  # fmt: skip
+"""Files and operations that make the CPU wait in a step of these presets, as docs/training.md says."""
+STEPS, EARLY, LATE = 40, 5, 25
+"""Of a run of a preset, and before a step that is looked at: in its first stage or without motion, and after that."""
 
 
 def config_of(name: str, **changes: object) -> TrainConfig:
@@ -49,6 +70,20 @@ def after_a_step(config: TrainConfig, scene: SceneData) -> Trainer:
     return trainer
 
 
+def assert_same_gradients(got: Trainer, wanted: Trainer) -> None:
+    """Of the last step, with what density control accumulates."""
+    found = []
+    for trainer in (got, wanted):
+        named = {n: p.grad for n, p in trainer.system.model.named_parameters() if p.grad is not None}
+        found.append(named | dict(enumerate(trainer.system.state().get("density", ()))))
+    assert len(found[1]) > 5
+    assert found[0].keys() == found[1].keys()
+    largest = max(float(tensor.abs().max()) for tensor in found[1].values())
+    for name, other in found[1].items():  # those of quaternions of round Gaussians are 0 but for rounding
+        size = max(float(other.abs().max()), 1e-6 * largest)
+        assert float((found[0][name] - other).abs().max()) <= tolerance("gradient.float32") * size, name
+
+
 @pytest.mark.parametrize("name", ALL_PARTS)
 def test_gradients_are_those_of_the_kernels(name: str, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also the loss, and what density control accumulates."""
@@ -56,19 +91,70 @@ def test_gradients_are_those_of_the_kernels(name: str, data: Path, monkeypatch: 
     wanted = after_a_step(config, scene)
     switch_kernels_off(monkeypatch)
     got = after_a_step(config, scene)
-    found = []
-    for trainer in (got, wanted):
-        named = {n: p.grad for n, p in trainer.system.model.named_parameters() if p.grad is not None}
-        found.append(named | dict(enumerate(trainer.system.state()["density"])))
-    assert len(found[1]) > 10
-    assert found[0].keys() == found[1].keys()
-    largest = max(float(tensor.abs().max()) for tensor in found[1].values())
-    for name_, other in found[1].items():  # those of quaternions of round Gaussians are 0 but for rounding
-        size = max(float(other.abs().max()), 1e-6 * largest)
-        assert float((found[0][name_] - other).abs().max()) <= tolerance("gradient.float32") * size, name_
+    assert_same_gradients(got, wanted)
     results = [trainer._result() for trainer in (got, wanted)]
     assert_close(results[0].loss, results[1].loss, "float32.relative")
     assert results[0][3:] == results[1][3:]
+
+
+def small_preset(name: str) -> TrainConfig:
+    """A preset without density control, whose motion or second stage begins after 10 steps."""
+    config = preset(name)
+    values: dict[str, Any] = {"steps": STEPS, "threads": 1, "log_every": 1000}
+    if name in VOLUMES:
+        return config.updated(rays=64, **values, **VOLUMES[name])
+    config = shrunk(config)
+    values |= {"refine_every_fraction": 0.0, "reset_every_fraction": 0.0}
+    if isinstance(config.own, SCGSSettings):
+        values |= {"node_stage_fraction": 10 / STEPS, "node_choice_fraction": 1.0}
+        values |= {"node_warm_up_fraction": 0.1, "warm_up_fraction": 0.1}
+        values |= {"node_refine_every_fraction": 0.0, "node_reset_every_fraction": 0.0}
+    elif config.model.layers:
+        values |= {"static_fraction": 10 / STEPS}
+    if config.curriculum.window_full_fraction:  # the window grows in each step
+        values |= {"window_full_fraction": 1.0}
+    model = dataclasses.replace(config.model, alpha_max=GSPLAT.alpha_max)
+    return config.updated(model=model, **values)
+
+
+def checkpoint_of(config: TrainConfig, scene: SceneData, path: Path, steps: int) -> Path:
+    """After so many steps with kernels, with layers that deform at once."""
+    trainer, generator = trained(config, scene, steps), torch.Generator().manual_seed(0)
+    model = trainer.system.model
+    if isinstance(model, DynamicGaussians):
+        with torch.no_grad():
+            for parameter in model.deformation.parameters():
+                parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    trainer.save_checkpoint(path, 0.0)
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [EARLY, LATE])
+@pytest.mark.parametrize("name", systems())
+def test_a_step_of_each_preset_is_that_of_the_kernels(
+    name: str, steps: int, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And reads nothing from the device, but what `READ` names."""
+    monkeypatch.setattr(losses, "RIGID_SAMPLES", 8)  # of 20 nodes
+    config, scene = small_preset(name), load_scene(data)
+    checkpoint = checkpoint_of(config, scene, tmp_path / "checkpoint.pt", steps)
+    trainers = []
+    for has_kernels in (True, False):
+        if not has_kernels:
+            switch_kernels_off(monkeypatch)
+        trainer = Trainer(config, scene)
+        trainer.load_checkpoint(checkpoint)
+        trainer.step()
+        trainers.append(trainer)
+    wanted, got = trainers
+    assert_same_gradients(got, wanted)
+    frame = scene.splits["train"][1]  # the order of the images is on the CPU in any case
+    monkeypatch.setattr(got._curriculum, "next", lambda *_: frame)
+    got.step()
+    with NoReads(*READ.get(name, ())):
+        for _ in range(2):
+            got.step()
 
 
 @pytest.mark.parametrize("name", ALL_PARTS)
@@ -127,6 +213,37 @@ def test_meters_agree_and_broken_steps_change_nothing() -> None:
     for one, other in zip(*(o.state_dict()["state"].values() for o in optimizers), strict=True):
         assert all(torch.equal(one[name], other[name]) for name in one)
     assert all(map(torch.equal, models[0].parameters(), models[1].parameters()))
+
+
+@pytest.mark.parametrize("broken", [(), (1, 4)], ids=["sound", "broken"])
+def test_entries_without_a_gradient_stay_on_a_device_too(
+    broken: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the bits that they had; the others become what they become on a CPU, where broken steps aren't taken."""
+    numbers = torch.Generator().manual_seed(0)
+    start, optimizers = torch.randn(6, 7, generator=numbers), []
+    parameters = [nn.Parameter(start.clone()) for _ in range(2)]
+    grads = [torch.randn(6, 7, generator=numbers) * (torch.rand(6, 7, generator=numbers) < 0.4) for _ in range(7)]
+    for has_kernels, parameter in zip((True, False), parameters, strict=True):
+        monkeypatch.setattr(arrays, "has_kernels", lambda tensor, has_kernels=has_kernels: has_kernels)
+        optimizer = MaskedAdam([{"params": [parameter], "lr": 0.1, "skips_zero": True}], fused=True)
+        for step, grad in enumerate(grads, start=1):
+            if has_kernels and step in broken:
+                continue
+            parameter.grad = grad.clone()
+            if not has_kernels:
+                optimizer.found_inf = torch.tensor(float(step in broken))  # type: ignore[attr-defined]
+                parameter.grad[0, 0] = torch.nan if step in broken else grad[0, 0]
+            optimizer.step()
+        optimizers.append(optimizer)
+    want, got = (o.state[p] for o, p in zip(optimizers, parameters, strict=True))
+    assert float(got["step"]) == float(want["step"]) == len(grads) - len(broken)
+    for one, other in ((parameters[1], parameters[0]), *((got[n], want[n]) for n in ("exp_avg", "exp_avg_sq"))):
+        error = float((one - other).detach().abs().max() / other.detach().abs().max())
+        assert error <= tolerance("float32.relative")
+    still = torch.stack([grad == 0 for step, grad in enumerate(grads, start=1) if step not in broken]).all(dim=0)
+    assert still.any()
+    assert torch.equal(parameters[1].detach()[still], start[still])
 
 
 def test_divergence_is_noticed_when_results_are_read() -> None:

@@ -21,14 +21,9 @@ from msdgs_train.gaussians.stored import load_stored
 from msdgs_train.systems.registry import preset
 from msdgs_train.volumes.model_file import StoredVolume
 from msdgs_train.volumes.system import VolumeSystem
-from tests.support.training_scene import StopAfter, assert_same_bits, state_of
+from tests.support.training_scene import VOLUMES, StopAfter, assert_same_bits, state_of
 
-SMALL: dict[str, dict[str, Any]] = {
-    "hexplane-slim": {"voxels": 12**3, "first_voxels": 8**3, "times": 4, "first_times": 3},
-    "tineuvox-s": {"voxels": 16**3, "width": 8},
-    "tineuvox-b": {"voxels": 16**3, "width": 8, "channels": 3},
-}
-PRESETS = pytest.mark.parametrize("name", SMALL)
+PRESETS = pytest.mark.parametrize("name", VOLUMES)
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
 
@@ -36,7 +31,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("no_curve")]
 def small(name: str, **changes: Any) -> TrainConfig:
     """A run of 20 steps that goes through all changes of the volume."""
     values = {"steps": 20, "threads": 1, "rays": 64, "log_every": 1, "eval_every": 0, "checkpoint_every": 0}
-    return preset(name).updated(**{**values, **SMALL[name], **changes})
+    return preset(name).updated(**{**values, **VOLUMES[name], **changes})
 
 
 @PRESETS
@@ -118,7 +113,7 @@ def test_damaged_model_files_are_refused(model: Path, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("in_threads")
 def test_it_is_compared_with_gaussians(data: Path, tmp_path: Path) -> None:
     table = tmp_path / "volumes.toml"
-    settings = "".join(f"{name} = {value}\n" for name, value in {**SMALL["hexplane-slim"], "rays": 64}.items())
+    settings = "".join(f"{name} = {value}\n" for name, value in {**VOLUMES["hexplane-slim"], "rays": 64}.items())
     table.write_text(f'[planes]\npreset = "hexplane-slim"\n{settings}[still]\npreset = "static"\n')
     arguments = [str(table), "--data", str(data), "--out", str(tmp_path / "out"), "--seeds", "0", "--steps", "12"]
     assert cli.main(["compare", *arguments, "--init-num-pts", "60", "--max-gaussians", "90", "--threads", "1"]) == 0
