@@ -7,7 +7,7 @@ class Clock:
     """Lays a schedule out over the time that is left, whatever a step costs in each phase.
 
     Published loops begin with a share of the steps without deformation, which are faster. They get this share if the
-    factor is known; with as large a share of the time, it would be a third of Grid4D's steps instead of 7 %.
+    factor is known: as large a share of the time is up to five times as many steps.
     """
 
     def __init__(
