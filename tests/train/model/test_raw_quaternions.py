@@ -80,8 +80,13 @@ def test_a_gpu_draws_them_by_covariances(stretch: float, absolute: bool, monkeyp
 
     def drawn() -> dict[str, Tensor]:
         leaves = {name: tensor.clone().requires_grad_() for name, tensor in given.items()}
-        how = {"absolute_gradients": absolute, "raw_quats": True}
-        rgb, alpha, info = rasterize(*leaves.values(), camera, torch.tensor([0.2, 0.6, 0.9]), **how)
+        rgb, alpha, info = rasterize(
+            *leaves.values(),
+            camera=camera,
+            background=torch.tensor([0.2, 0.6, 0.9]),
+            absolute_gradients=absolute,
+            raw_quats=True,
+        )
         (torch.cat([rgb, alpha[..., None]], dim=2) * weights).sum().backward()
         assert info.means2d_grads is not None
         found = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
