@@ -60,7 +60,7 @@ class Table:
     """Names of each scene's folder, by the paper's name."""
     methods: Sequence[Method]
     width: int | None = None
-    """Of images in pixels, where the dataset has larger ones."""
+    """Of the images of its scenes, in pixels, which are downscaled to it."""
     notes: Sequence[str] = ()
     """How all rows differ from what is published."""
 
@@ -113,8 +113,12 @@ def read_systems(
         base = recipe(published, settings["preset"], table.dataset)
         changes = scene_recipes(published, settings["preset"], table.dataset)
         own = {scene.name: changes[key] for scene in scenes if (key := _scene_key(table, scene, changes))}
-        config = _config(name, settings, table)
-        configs = {scene.name: base.changed(own.get(scene.name, {})).applied(config) for scene in scenes}
+        config = _config(name, settings)
+        sized = config.updated(size=table.width) if table.width else config
+        configs = {
+            scene.name: base.changed(own.get(scene.name, {})).applied(sized if scene.name in table.scenes else config)
+            for scene in scenes
+        }
         configs = {scene: budget.of(config) for scene, config in configs.items()}
         recipes = {"": base} | {scene: Recipe().changed(change) for scene, change in own.items()}
         found[method.name] = Trained(f"{name} small" if small else name, configs, recipes)
@@ -142,10 +146,10 @@ def _definition(definitions: Mapping[str, Any], name: str, variant: str) -> tupl
     return _definition(definitions, settings, variant) if isinstance(settings, str) else (name, dict(settings))
 
 
-def _config(name: str, settings: Mapping[str, Any], table: Table) -> TrainConfig:
+def _config(name: str, settings: Mapping[str, Any]) -> TrainConfig:
     """The settings of systems.toml, before those of a dataset."""
     own = {key: value for key, value in settings.items() if key != NUM_LAYERS}
-    config = read_system(name, ({"size": table.width} if table.width else {}) | own, PaperBudget())
+    config = read_system(name, own, PaperBudget())
     num_layers = settings.get(NUM_LAYERS)
     return config if num_layers is None else config.updated(layers=config.model.layers[:1] * num_layers)
 

@@ -6,8 +6,8 @@ SMOOTHING = 0.9  # of the time of an image: a moving average over about 10 steps
 class Clock:
     """Lays a schedule out over the time that is left, whatever a step costs in each phase.
 
-    Published loops begin with a share of the steps without deformation, which are faster. They get this share if the
-    factor is known: as large a share of the time is up to five times as many steps.
+    Steps without deformation are faster. If the factor is known, they are the fraction of all optimizer steps that the
+    schedule gives them; the same fraction of the time would be up to five times as many.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class Clock:
         return max(int(self._position) - step, 0)
 
     def _steps_left(self) -> float:
-        """The steps that are left, each in steps as long as those of the present phase."""
+        """Cost of the remaining steps, in units of a step of the present phase."""
         left = self._num_steps - self._position
         static = self._static_steps - self._position
         return left if static <= 0 else static + self._deforming_cost * (left - static)

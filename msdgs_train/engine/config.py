@@ -43,9 +43,9 @@ class RunConfig(Checked):
     gpu_image_memory: float = 8.0
     """cuda: GiB of training images that stay on the GPU, as 8-bit RGBA; others are copied whenever they are drawn."""
     minutes: Annotated[float | None, optional("MINUTES")] = None
-    """Length of the run instead of --steps. Each phase has its share of the time; steps before motion begins have their
-    share of the steps in loops without a growing window. Evaluation and saving count, compiling kernels doesn't. The
-    same seed no longer gives the same bits."""
+    """Length of the run instead of --steps. Each phase gets its fraction of the time; in loops without a growing
+    window, steps before motion are instead the same fraction of optimizer steps as with --steps. Evaluation and saving
+    count, compiling kernels doesn't. The same seed no longer gives the same bits."""
     time: Literal["wall", "cpu"] = "wall"
     """What --minutes and reports count: time that passes, or the CPU time of all threads, which other work on the
     machine hardly changes."""

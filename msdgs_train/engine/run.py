@@ -200,11 +200,16 @@ class Run:
                 trial.step(max(self.config.run.steps // TRIAL_STEPS, 1))
         for split in self.splits[:1]:
             next(trial.evaluate(split))
-        schedule, deform_start = self.trainer.schedule, self.trainer.schedule.deform_start_step
-        if not schedule.grows_window and schedule.deforms(deform_start) and self.trainer.step_count < deform_start:
+        if self._counts_static_steps() and not self.observer.should_stop():
+            deform_start = self.trainer.schedule.deform_start_step
             self.deforming_cost = self._seconds_of_rehearsal(trial, deform_start) / self._seconds_of_rehearsal(trial, 0)
             self.clock = self._new_clock()
         self.started += self._now() - before
+
+    def _counts_static_steps(self) -> bool:
+        """Whether steps without deformation are left, in a loop in which they are a fraction of the steps."""
+        schedule, start = self.trainer.schedule, self.trainer.schedule.deform_start_step
+        return not schedule.grows_window and schedule.deforms(start) and self.trainer.step_count < start
 
     def _seconds_of_rehearsal(self, trial: Trainer, step: int) -> float:
         taken = []

@@ -43,7 +43,7 @@ class LoadedModel(NamedTuple):
         own = 0 if modulation is None else sum(p.numel() for p in modulation.parameters())
         embeddings = 0 if modulation is None else self.model.gaussians.attributes[EMBEDDINGS].numel()
         layers = (*self.model.deformation.parameters(), *self.model.support.parameters())
-        return ParameterCounts(sum(p.numel() for p in layers), own + embeddings)
+        return ParameterCounts(sum(p.numel() for p in layers if p.requires_grad), own + embeddings)
 
     @torch.no_grad()
     def render(self, camera: Camera, t: float, num_layers: int | None = None) -> Tensor:

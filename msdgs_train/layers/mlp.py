@@ -60,8 +60,8 @@ class MLPConfig(LayerConfig):
     time_features: int = 30
     """Outputs of the network of time."""
     time_network: bool = True
-    """Off: encoded time is read as it is, as by Deformable-3D-Gaussians in real scenes: the network of time is the
-    identity, of the sizes that takes, and isn't trained."""
+    """Off: layers read the encoded time itself, as in Deformable-3D-Gaussians for real scenes; `time_width` and
+    `time_features` are then ignored."""
     skip: int = 0
     """Skip connection: the input is concatenated after so many hidden layers, fewer than `depth`; 0: none."""
     initialization: str = "local"
@@ -78,6 +78,8 @@ class MLPConfig(LayerConfig):
         for name in ("width", "depth", "xyz_frequencies", "time_frequencies", "time_width", "time_features"):
             check_size(f"{field}.{name}", getattr(self, name))
         check_size(f"{field}.skip", self.skip, least=0)
+        if not isinstance(self.time_network, bool):
+            raise InvalidInput(f"{field}.time_network", "True or False", self.time_network)
         if self.initialization not in ("local", "torch"):
             raise InvalidInput(f"{field}.initialization", "local or torch", self.initialization)
         if self.skip >= self.depth:
