@@ -80,7 +80,10 @@ def test_the_cap_follows_the_size_of_the_images(
 RESUMED: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "white": ({"background": "white"}, (3, 11, 16)),  # in the static phase, between and after densifications
     "random": ({"background": "random"}, (3, 11, 16)),
-    "unseen removed": ({"prune_unseen_passes": 0.05, "window_full_fraction": 0.0, "scene_half_size": 2.0}, (11, 16)),
+    "unseen removed": (
+        {"prune_unseen_passes": 0.05, "window_full_fraction": 0.0, "scene_half_size": 2.0, "max_gaussians": 80},
+        (11, 16),
+    ),
     "mlp on nodes": ({"model": MODELS["mlp on nodes"]}, (3, 13)),
     "mixed on nodes": ({"model": MODELS["mixed on nodes"], "batch_size": 2}, (8, 13)),
     "hash4d": ({"model": MODELS["hash4d"], "batch_size": 2, "threads": 2}, (13,)),
