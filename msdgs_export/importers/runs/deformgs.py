@@ -73,6 +73,7 @@ def network_config(state: State) -> MLPConfig:
         time_frequencies=frequencies,
         time_width=time_width,
         time_features=time_features,
+        time_network="timenet.0.weight" in state,
         skip=depth // 2 + 1,
     )
 
@@ -102,10 +103,8 @@ def fill_network(model: DynamicGaussians, state: State, heads: Mapping[str, int]
         state.fill(layer.time_hidden, "timenet.0")
         layer.time_hidden.weight.copy_(layer.time_hidden.weight[:, times])
         state.fill(layer.time_output, "timenet.2")
-    else:  # pass the encoded time on: x = relu(x) − relu(−x)
-        inputs, eye = torch.cat([order, layer.xyz_features + times]), torch.eye(features)
-        _set(layer.time_hidden, torch.cat([eye, -eye]), torch.zeros(2 * features))
-        _set(layer.time_output, torch.cat([eye, -eye], dim=1), torch.zeros(features))
+    else:
+        inputs = torch.cat([order, layer.xyz_features + times])
     for i, linear in enumerate([layer.first, *layer.trunk]):
         assert isinstance(linear, nn.Linear)
         state.fill(linear, f"linear.{i}")
