@@ -92,12 +92,12 @@ class Paper:
         scenes = find_scenes(table, self.data)
         require_known("methods", self.methods, [method.name for method in table.methods])
         require_known("scenes", self.scenes, [scene.name for scene in scenes])
-        trained, absent = read_systems(table, scenes, self.budget, small=self.small)
+        trained = read_systems(table, scenes, self.budget, small=self.small)
         csv = self.csv or self.out / "paper.csv"
         runs = runs_of(trained, scenes, self.seeds, self.out)
         wanted = {row.system for method, row in trained.items() if method in self.methods or not self.methods}
         chosen = [run for run in runs if run.system in wanted and (run.scene in self.scenes or not self.scenes)]
-        results = Results(table, trained, absent, scenes, runs, (), self.budget, self.small)
+        results = Results(table, trained, scenes, runs, (), self.budget, self.small)
 
         def write() -> None:
             self._write(replace(results, rows=rows_of(runs, csv)))
@@ -173,9 +173,8 @@ def assert_as_published(folder: Path) -> None:
 
     table = read_table("table3")
     scenes = [Scene("Broom", folder, {}), Scene("Chicken", folder, {}), Scene("other", folder / "peel-banana", {})]
-    trained, absent = read_systems(table, scenes, PaperBudget(), small=False)
+    trained = read_systems(table, scenes, PaperBudget(), small=False)
     runs = runs_of(trained, scenes, (0, 1), folder)
-    assert not absent
     assert [(run.scene, run.seed) for run in runs[:: len(trained)]] == [
         (s.name, seed) for seed in (0, 1) for s in scenes
     ]
@@ -186,10 +185,10 @@ def assert_as_published(folder: Path) -> None:
     assert [config.run.steps for config in trained["Grid4D"].configs.values()] == [30_000, 40_000, 30_000]
     sizes = {scene: {row.configs[scene].data.size for row in trained.values()} for scene in ("Broom", "other")}
     assert sizes == {"Broom": {536}, "other": {None}}
-    short, _ = read_systems(table, scenes, PaperBudget(steps=170, size=90), small=False)
+    short = read_systems(table, scenes, PaperBudget(steps=170, size=90), small=False)
     config = short["4DGS"].configs["Broom"]
     assert (config.data.size, Schedule.from_config(config).restart_step) == (90, 30)
-    page = sections(Results(table, trained, absent, scenes, runs, (), PaperBudget(), False))
+    page = sections(Results(table, trained, scenes, runs, (), PaperBudget(), False))
     (lines,) = (section.lines for section in page if section.heading == "Settings")
     assert [line[1] for line in lines if line[0] == "Grid4D"] == ["all", "Broom", "Chicken", "other"]
 

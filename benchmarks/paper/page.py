@@ -36,7 +36,6 @@ class Results:
 
     table: Table
     trained: Mapping[str, Trained]  # by method
-    absent: Sequence[str]
     scenes: Sequence[Scene]
     runs: Sequence[Run]
     rows: Sequence[Row]
@@ -119,8 +118,6 @@ def _conditions(results: Results) -> Iterator[str]:
         yield "No run is finished."
     if absent := [scene for scene in results.table.scenes if scene not in {found.name for found in results.scenes}]:
         yield f"Scenes that weren't there: {', '.join(absent)}."
-    if results.absent:
-        yield f"Systems that aren't registered, with their presets: {', '.join(results.absent)}."
     for scene in results.scenes:
         if (every := scene.settings.get("llffhold")) and any(row["scene"] == scene.name for row in rows):
             yield (

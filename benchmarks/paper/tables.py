@@ -12,7 +12,6 @@ from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_system
 from msdgs_train.comparison.scenes import Scene, read_scenes
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.settings import optional
-from msdgs_train.systems.registry import systems
 
 FOLDER = Path(__file__).parent
 MEAN = "mean"
@@ -101,15 +100,12 @@ class Trained:
 
 def read_systems(
     table: Table, scenes: Sequence[Scene], budget: Budget, *, small: bool
-) -> tuple[dict[str, Trained], list[str]]:
-    """What is trained for each row on each scene; and the presets of other rows, which are not registered."""
+) -> dict[str, Trained]:
+    """What is trained for each row on each scene."""
     definitions, published = _contents("systems"), {} if small else _contents("published")
-    found, absent = {}, []
+    found = {}
     for method in table.methods:
         name, settings = _definition(definitions, method.system, "small" if small else "published")
-        if settings["preset"] not in systems():
-            absent.append(f"{method.name} ({settings['preset']})")
-            continue
         base = recipe(published, settings["preset"], table.dataset)
         changes = scene_recipes(published, settings["preset"], table.dataset)
         own = {scene.name: changes[key] for scene in scenes if (key := _scene_key(table, scene, changes))}
@@ -122,7 +118,7 @@ def read_systems(
         configs = {scene: budget.of(config) for scene, config in configs.items()}
         recipes = {"": base} | {scene: Recipe().changed(change) for scene, change in own.items()}
         found[method.name] = Trained(f"{name} small" if small else name, configs, recipes)
-    return found, absent
+    return found
 
 
 def runs_of(trained: Mapping[str, Trained], scenes: Sequence[Scene], seeds: Sequence[int], out: Path) -> list[Run]:

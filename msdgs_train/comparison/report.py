@@ -49,7 +49,8 @@ def write_comparison(
     """
     out.mkdir(parents=True, exist_ok=True)
     text = [as_markdown(results)] if results else []
-    text += [scenes_as_markdown(rows, systems), best_as_markdown(rows, systems)]
+    if rows:
+        text += [scenes_as_markdown(rows, systems), best_as_markdown(rows, systems)]
     if missing:
         text.append(f"{missing} runs are not finished and are not in the tables.\n")
     write_text(out / TABLE, "\n".join(text))

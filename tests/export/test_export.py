@@ -71,6 +71,7 @@ def scene_file(tmp_path_factory: pytest.TempPathFactory, model: DynamicGaussians
         (300, {"modulation_targets": ("quats", "means", "scales"), "layers": ("plane", "mlp")}, 300),
         (300, {"scale_space": "linear", "noise": 0.03}, 300),
         (300, {"layers": (replace(MLP, depth=4, skip=3),) * 2}, 300),
+        (300, {"layers": (replace(MLP, time_network=False), "plane")}, 300),
         (300, {"layers": (replace(PLANE, multires=(1, 2), resolution=6),) * 2}, 300),
         (300, {"sh_degree": 0}, 300),
         (300, {"layers": ("mlp", "plane"), "opacity_head": True}, 300),

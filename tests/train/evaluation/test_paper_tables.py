@@ -3,14 +3,14 @@
 import dataclasses
 import re
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from msdgs_train.comparison.matrix import Budget, read_system
+from benchmarks.paper.tables import Method, PaperBudget, Trained, read_systems, read_table
+from msdgs_train.comparison.scenes import Scene
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.base import SceneBounds
@@ -20,7 +20,6 @@ from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.parts import from_plain
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.layers.registry import LAYERS
-from msdgs_train.systems.registry import preset, systems
 from msdgs_train.volumes.hexplane import HexPlaneConfig
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close
@@ -76,45 +75,18 @@ def test_every_number_has_a_scene_and_every_row_a_system(name: str) -> None:
         assert {len(values) for values in row.values()} <= {len(table["metrics"])}
 
 
-def config_of(name: str, variant: str) -> TrainConfig | None:
-    """The settings of a system, as the benchmark reads them; None if its preset isn't registered."""
-    settings = contents("systems")[name][variant]
-    if isinstance(settings, str):
-        return config_of(settings, variant)
-    num_layers = settings.pop("num_layers", 0)
-    if settings["preset"] not in systems():
-        return None
-    config = read_system(name, settings, Budget(steps=preset(settings["preset"]).run.steps))
-    return config.updated(layers=config.model.layers[:1] * num_layers) if num_layers else config
+DATASETS = {"D-NeRF": "table1", "Neu3D": "table2", "HyperNeRF": "table3"}
 
 
-def entries(name: str, dataset: str, scene: str) -> Iterator[dict[str, Any]]:
-    """Those of published.toml that count, the last most."""
-    entry = contents("published")[name][dataset]
-    if "like" in entry:
-        other, dataset = entry["like"]
-        yield from entries(other, dataset, "")
-    yield entry
-    yield entry.get("scenes", {}).get(scene, {})
+def trained(system: str, dataset: str, scene: str = "", *, small: bool = False) -> Trained:
+    """What the benchmark trains for a system of systems.toml."""
+    table = dataclasses.replace(read_table(DATASETS[dataset]), methods=[Method(system, system)])
+    return read_systems(table, [Scene(scene, Path(scene), {})], PaperBudget(), small=small)[system]
 
 
 def published(system: str, dataset: str, scene: str) -> TrainConfig:
-    """What is trained for a row on a scene."""
-    config, settings, fractions, layer = config_of(system, "published"), {}, {}, {}
-    assert config is not None
-    c, d, before = config.curriculum, config.density, config.run.steps
-    kept = {"static_fraction": c.static_fraction, "sh_degree_fraction": config.optimizer.sh_degree_fraction}
-    kept |= {name: getattr(d, name) for name in d.names() if name.startswith(("refine_", "reset_"))}
-    steps = before
-    for entry in entries(config.run.system, dataset, scene):
-        steps = entry.get("steps", steps)
-        settings |= entry.get("settings", {})
-        fractions |= entry.get("in_steps", {})
-        layer |= entry.get("layer", {})
-    settings = {name: fraction * before / steps for name, fraction in kept.items()} | settings
-    settings |= {name: count / steps for name, count in fractions.items()}
-    layers = [dataclasses.replace(own, **layer) for own in config.model.layers]
-    return config.updated(steps=steps, layers=layers, **settings)
+    """The settings of a row on a scene."""
+    return trained(system, dataset, scene).configs[scene]
 
 
 def rates(config: TrainConfig, step: int) -> dict[str, float]:
@@ -136,16 +108,16 @@ def test_every_row_has_settings_for_every_scene(name: str) -> None:
     table = contents(name)
     for method in table["methods"]:
         for scene in table["scenes"]:
-            config = published(method["system"], table["dataset"], scene)
-            Schedule.from_config(config)
-            assert any(entry.get("source") for entry in entries(config.run.system, table["dataset"], scene))
+            row = trained(method["system"], table["dataset"], scene)
+            Schedule.from_config(row.configs[scene])
+            assert any(recipe.source for recipe in row.recipes.values())
 
 
 def test_published_settings_are_of_known_rows_and_scenes() -> None:
     tables = [contents(name) for name in TABLES]
     scenes = {table["dataset"]: {*table["scenes"], "Lego"} for table in tables}
     names = {(method["system"], table["dataset"]) for table in tables for method in table["methods"]}
-    used = {(config.run.system, dataset) for name, dataset in names if (config := config_of(name, "published"))}
+    used = {(published(name, dataset, "").run.system, dataset) for name, dataset in names}
     found = contents("published")
     assert {(name, dataset) for name, of in found.items() for dataset in of} == used
     keys = {"source", "steps", "in_steps", "settings", "layer", "differs"}
@@ -282,22 +254,18 @@ def test_grid4d_on_lego_is_as_docs_say() -> None:
     assert from_plain("layers", shown[1], LAYERS) == layer
 
 
-@pytest.mark.parametrize("variant", ["published", "small"])
-def test_systems_can_be_read(variant: str) -> None:
-    read = {name for name in contents("systems") if config_of(name, variant)}
-    assert {"deformgs", "4dgs", "sc-gs", "msdgs-mlp", "msdgs-plane", "msdgs-mlp no weights", "msdgs-mlp K=10"} <= read
+@pytest.mark.parametrize("small", [False, True])
+def test_systems_can_be_read(small: bool) -> None:
+    for name in contents("systems"):
+        Schedule.from_config(trained(name, "D-NeRF", small=small).configs[""])
 
 
 def test_systems_have_the_published_parameters() -> None:
     """Table 4, in millions; that of 4DGS includes heads of opacity and color, which are off in its own settings."""
     for method in contents("table4")["methods"]:
-        config = config_of(method["system"], "published")
-        assert config is not None
-        model = (
-            dataclasses.replace(config.model, opacity_head=True, sh_head=True)
-            if method["name"] == "4DGS"
-            else config.model
-        )
+        model = published(method["system"], "D-NeRF", "").model
+        if method["name"] == "4DGS":
+            model = dataclasses.replace(model, opacity_head=True, sh_head=True)
         layers = [layer.build(SceneBounds(1.0), model.heads, None) for layer in model.layers]
         count = sum(p.numel() for layer in layers for p in layer.parameters())
         assert f"{count / 1e6:.2f}" == f"{method['parameters'][0]:.2f}", method["name"]
