@@ -120,10 +120,10 @@ class Trainer:
         return self._result()
 
     def rehearse(self, step: int) -> None:
-        """Compute the gradients of one training image as in this step of the schedule, which becomes the present one,
-        without training on them: for timings."""
+        """Compute the gradients of one training image, or batch of rays, as in this step of the schedule, which becomes
+        the present one, without training on them: for timings."""
         self.step_count = step
-        frame = self.scene.splits["train"][0]
+        frame = self.scene.splits["train"][0] if self._rays is None else self._next(0)
         view = self._differentiate(self.system.parameter_groups(), frame, self._next_background(), number=0)
         float(view.loss)  # waits for a GPU
 

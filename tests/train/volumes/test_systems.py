@@ -172,3 +172,12 @@ def test_training_goes_back_to_its_checkpoint(data: Path, tmp_path: Path, monkey
     config = small("tineuvox-s", steps=40, checkpoint_every=3)
     assert fit(config, data, tmp_path).status == "finished"
     assert torch.load(tmp_path / CHECKPOINT, weights_only=True)["rollbacks"] == 1
+
+
+def test_a_step_can_be_timed_without_training(data: Path) -> None:
+    trainer = Trainer(small("tineuvox-s"), load_scene(data))
+    before = [p.detach().clone() for group in trainer.system.parameter_groups() for p in group.params]
+    trainer.rehearse(5)
+    after = [p for group in trainer.system.parameter_groups() for p in group.params]
+    assert trainer.step_count == 5
+    assert all(torch.equal(old, new) for old, new in zip(before, after, strict=True))
