@@ -5,8 +5,8 @@
         frame.rgb, frame.alpha, frame.depth
 
 ClientError         also a value that can't be sent, such as NaN, or an answer of something else than the service
-├── Problem         the service answered with an error: `status`, `detail` and `errors` by field
-└── Unreachable     there was no answer
+├── Problem         an answer with an error, or a redirect: `status`, `detail` and `errors` by field
+└── Unreachable     there was no whole answer
 """
 
 import base64
@@ -14,12 +14,12 @@ import io
 import json
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -35,6 +35,8 @@ Real = float | np.floating | np.integer
 Whole = int | np.integer
 Time = Real | Sequence[Real] | npt.NDArray[Any]
 Vector = Sequence[Real] | npt.NDArray[Any]
+Body = TypeVar("Body", str, bytes)
+Content = TypeVar("Content")
 
 DEFAULT_CHANNELS: tuple[Channel, ...] = ("rgb", "alpha", "depth")
 WIDTHS: dict[Channel, int] = {"rgb": 3, "alpha": 1, "depth": 1, "motion": 2, "gaussians": 1}
@@ -48,11 +50,11 @@ class ClientError(Exception):
 
 
 class Unreachable(ClientError):
-    """There was no answer: the connection failed or timed out."""
+    """There was no answer, or no whole one: the connection failed or timed out."""
 
 
 class Problem(ClientError):
-    """The service answered with an error (RFC 9457)."""
+    """The service answered with an error (RFC 9457), or something before it with an error or a redirect."""
 
     def __init__(self, status: int, detail: str, errors: Sequence[Mapping[str, str]] = ()) -> None:
         super().__init__(f"{status}: {detail}")
@@ -153,8 +155,8 @@ class Client:
         tries: int = TRIES,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        """`seconds` is the time limit of a call. While the service is overloaded, a call is tried up to `tries` times,
-        1 or more, after the seconds that the service asks for."""
+        """`seconds` is the time limit of a call. While the service is overloaded, a call but `render_many` is tried up
+        to `tries` times, 1 or more, after the seconds that the service asks for."""
         headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
         self._http = httpx.Client(base_url=url, headers=headers, timeout=seconds, transport=transport)
         self._tries = max(tries, 1)
@@ -194,8 +196,7 @@ class Client:
             background=background, shutter=shutter, dt=dt, steps=steps, format="npy",
         )  # fmt: skip
         response = self._call("POST", "/render", json=body)
-        pixels = _array(response)
-        return _frame(pixels, channels, response.headers)
+        return _read(response, lambda file: _frame(_array(file), channels, response.headers), response.content)
 
     def render_file(self, camera: Camera, t: Time, *, format: Format = "png", **options: Any) -> bytes:
         """Return a frame as an image file; `options` are those of `request_body`."""
@@ -208,29 +209,27 @@ class Client:
         """
         frames = [_plain(body, f"frames.{number}") for number, body in enumerate(bodies)]
         with self._connected(), self._http.stream("POST", "/render/batch", json={"frames": frames}) as response:
-            if response.is_error:
+            if not response.is_success:
                 response.read()
                 raise _problem(response)
             for text in response.iter_lines():
-                line = json.loads(text)
-                if "data" in line:
-                    yield line["index"], base64.b64decode(line["data"])
-                else:
-                    problem = line["problem"]
-                    yield line["index"], Problem(line["status"], problem["detail"], problem["errors"])
+                yield _read(response, _frame_of_batch, text)
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes that are served."""
-        return [scene["name"] for scene in self._call("GET", "/scenes").json()["scenes"]]
+        response = self._call("GET", "/scenes")
+        return _read(response, lambda text: [scene["name"] for scene in json.loads(text)["scenes"]], response.content)
 
     def scene(self, name: str) -> dict[str, Any]:
         """Return the description of a scene: time range, cameras, plan, measured error."""
-        return self._call("GET", f"/scenes/{quote(name, safe='')}").json()
+        response = self._call("GET", f"/scenes/{quote(name, safe='')}")
+        return _read(response, lambda text: dict(json.loads(text)), response.content)
 
     def add_scene(self, name: str, file: Path, *, replace: bool = False) -> str:
         """Add a scene file, if the service allows uploads, and return its SHA-256."""
         query = {"name": name, "replace": str(replace).lower()}
-        return self._call("POST", "/scenes", params=query, content=file.read_bytes()).json()["sha256"]
+        response = self._call("POST", "/scenes", params=query, content=file.read_bytes())
+        return _read(response, lambda text: json.loads(text)["sha256"], response.content)
 
     def delete_scene(self, name: str) -> None:
         """Delete a scene, if the service allows uploads."""
@@ -240,7 +239,7 @@ class Client:
         """Whether the service is ready to render frames."""
         try:
             return self._http.get("/ready").is_success
-        except httpx.TransportError:
+        except httpx.RequestError:
             return False
 
     @contextmanager
@@ -248,7 +247,7 @@ class Client:
         """Raise `Unreachable` if the connection fails."""
         try:
             yield
-        except httpx.TransportError as error:
+        except httpx.RequestError as error:
             raise Unreachable(f"{self._http.base_url}: {error or type(error).__name__}") from error
 
     def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
@@ -259,7 +258,7 @@ class Client:
             if response.status_code != OVERLOADED or not wait.isdecimal() or number == self._tries - 1:
                 break  # a proxy may state a date instead of seconds
             time.sleep(int(wait))
-        if response.is_error:
+        if not response.is_success:  # redirects aren't followed: a POST would lose its body
             raise _problem(response)
         return response
 
@@ -342,12 +341,25 @@ def _frame(pixels: np.ndarray, channels: Sequence[Channel], headers: httpx.Heade
     return Frame(**drawn, plan=headers.get("Msdgs-Plan", ""), milliseconds=milliseconds)
 
 
-def _array(response: httpx.Response) -> np.ndarray:
+def _frame_of_batch(text: str) -> tuple[int, bytes | Problem]:
+    line = json.loads(text)
+    if "data" in line:
+        return line["index"], base64.b64decode(line["data"])
+    problem = line["problem"]
+    return line["index"], Problem(line["status"], problem["detail"], problem["errors"])
+
+
+def _array(file: bytes) -> np.ndarray:
+    return np.lib.format.read_array(io.BytesIO(file), allow_pickle=False)
+
+
+def _read(response: httpx.Response, read: Callable[[Body], Content], body: Body) -> Content:
+    """Read the body of an answer, or a part of it. Raises `ClientError` if it isn't the service's."""
     try:
-        return np.lib.format.read_array(io.BytesIO(response.content), allow_pickle=False)
-    except ValueError:
+        return read(body)
+    except (ValueError, LookupError, TypeError):
         kind = response.headers.get("Content-Type", "without a type")
-        raise ClientError(f"{response.url}: the answer is no array of pixels, but {kind}") from None
+        raise ClientError(f"{response.url}: not an answer of the service, but {kind}") from None
 
 
 def _problem(response: httpx.Response) -> Problem:
@@ -355,4 +367,5 @@ def _problem(response: httpx.Response) -> Problem:
         problem = response.json()
         return Problem(response.status_code, problem["detail"], problem["errors"])
     except (ValueError, KeyError, TypeError):  # an answer of a proxy in between
-        return Problem(response.status_code, response.reason_phrase)
+        place = f" to {response.headers['Location']}" if response.has_redirect_location else ""
+        return Problem(response.status_code, response.reason_phrase + place)

@@ -189,9 +189,41 @@ def test_an_answer_of_another_service_is_named(content: bytes):
     answer = httpx.Response(200, headers={"Content-Type": "text/html"}, content=content)
     with (
         Client(transport=httpx.MockTransport(lambda _: answer)) as client,
-        pytest.raises(ClientError, match="no array of pixels, but text/html"),
+        pytest.raises(ClientError, match="not an answer of the service, but text/html"),
     ):
         client.render(LEVEL, 0.5)
+
+
+CALLS: dict[str, Callable[[Client], object]] = {
+    "render": lambda client: client.render(LEVEL, 0.5),
+    "render_file": lambda client: client.render_file(LEVEL, 0.5),
+    "render_many": lambda client: list(client.render_many([request_body(LEVEL, 0.5)])),
+    "scenes": Client.scenes,
+    "scene": lambda client: client.scene("a"),
+    "add_scene": lambda client: client.add_scene("a", Path(__file__)),
+    "delete_scene": lambda client: client.delete_scene("a"),
+}
+
+
+@pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+def test_a_redirect_is_a_problem(call: Callable[[Client], object]):
+    answer = httpx.Response(301, headers={"Location": "https://elsewhere/"}, html="<html>")
+    with (
+        Client(transport=httpx.MockTransport(lambda _: answer)) as client,
+        pytest.raises(Problem, match="301: Moved Permanently to https://elsewhere/"),
+    ):
+        call(client)
+
+
+@pytest.mark.parametrize("text", ["<html>", "[1]", "null", "1"])
+@pytest.mark.parametrize("name", ["render", "render_many", "scenes", "scene", "add_scene"])
+def test_other_text_is_no_answer_of_the_service(name: str, text: str):
+    answer = httpx.Response(200, headers={"Content-Type": "text/plain"}, text=text)
+    with (
+        Client(transport=httpx.MockTransport(lambda _: answer)) as client,
+        pytest.raises(ClientError, match="not an answer of the service, but text/plain"),
+    ):
+        CALLS[name](client)
 
 
 def test_files_and_blur(client: Client):

@@ -257,7 +257,8 @@ def test_grid4d_on_lego_is_as_docs_say() -> None:
 @pytest.mark.parametrize("small", [False, True])
 def test_systems_can_be_read(small: bool) -> None:
     for name in contents("systems"):
-        Schedule.from_config(trained(name, "D-NeRF", small=small).configs[""])
+        config = trained(name, "D-NeRF", small=small).configs[""]
+        assert Schedule.from_config(config).num_steps == config.run.steps
 
 
 def test_systems_have_the_published_parameters() -> None:
