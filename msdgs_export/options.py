@@ -33,7 +33,8 @@ class ExportOptions:
     msdgs-serve scenes/ball.onnx
 
     Scenes of other programs are detected by their contents: INRIA's and SuperSplat's .ply, .spz, SOG, .splat and
-    .ksplat, numbered sequences of them, and runs of Deformable-3D-Gaussians and 4DGaussians (docs/formats.md):
+    .ksplat, numbered sequences of them, and runs of Deformable-3D-Gaussians, 4DGaussians, SC-GS and Grid4D
+    (docs/formats.md):
 
     msdgs-export garden.ply -o scenes/garden.onnx --up z
 
@@ -47,7 +48,8 @@ class ExportOptions:
     output: Annotated[Path | None, optional("PATH", aliases=["-o"])] = None
     """The scene file to write; by default beside the model, ending in .onnx."""
     format: Annotated[str, tyro.conf.arg(metavar="FORMAT")] = "detect"
-    """Format of the input, as docs/formats.md lists them: model, ply, ..., deformgs, 4dgs. `detect` looks inside."""
+    """Format of the input, as docs/formats.md lists them: model, ply, ..., deformgs, 4dgs, scgs, grid4d. `detect` looks
+    inside."""
     min_psnr: Annotated[float | None, optional("DB")] = None
     """PSNR of the worst frame against the exact network; less is faster. By default 50, from where no difference is
     visible; with --data what adds 0.05 dB to the error against held-out images; with --max-mb alone no limit."""
@@ -137,8 +139,9 @@ class ConvertOptions:
     """The output: name.ply, .spz, .glb, .usdc (or .usda, .usd), .visionary.onnx, .onnx, or a folder."""
     t: Annotated[float | None, optional("TIME")] = None
     """The time of a single file; by default the start of the scene's time range."""
-    frames: int = 30
-    """The number of files in a folder or frames of OpenUSD, evenly over the time range, including both ends."""
+    frames: Annotated[int | None, optional("INT")] = None
+    """The number of files in a folder or frames of OpenUSD, evenly over the time range, including both ends; by default
+    30."""
     min_psnr: Annotated[float | None, optional("DB")] = None
     """PSNR of the written file against the scene, below which it isn't kept; by default 45 for SPZ and Visionary,
     50 for scene files, and 60 for the others, which are lossless."""
@@ -177,9 +180,12 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def require_folder_of(field: str, file: Path | None) -> None:
-    """Raise `InvalidInput` naming `field` if a file can't be written there: its folder doesn't exist, or it is one."""
-    if file is not None and not file.parent.is_dir():
+def require_writable(field: str, file: Path, source: Path) -> None:
+    """Raise `InvalidInput` naming `field` if a file can't be written there: its folder doesn't exist, it is a folder,
+    or it is the `source` that is read."""
+    if not file.parent.is_dir():
         raise InvalidInput(field, "in a folder that exists", str(file))
-    if file is not None and file.is_dir():
+    if file.is_dir():
         raise InvalidInput(field, "a file, not a folder", str(file))
+    if file.exists() and source.exists() and file.samefile(source):
+        raise InvalidInput(field, "another file than the one that is read", str(file))

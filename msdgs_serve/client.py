@@ -91,7 +91,7 @@ class LookAt:
 class Matrix:
     """A pose and intrinsics: `fov_y` in degrees, or `fx` and optionally `fy`, `cx`, `cy` in pixels.
 
-    `fx` is in pixels per scene unit if orthographic. `distortion` is k1 to k4 of a fisheye camera, as in OpenCV.
+    `fx` is in pixels per world unit if orthographic. `distortion` is k1 to k4 of a fisheye camera, as in OpenCV.
     """
 
     camera_to_world: npt.ArrayLike  # [4, 4]
@@ -136,7 +136,7 @@ class Frame:
 
     rgb: FloatArray | None  # [H, W, 3] sRGB-encoded; premultiplied by alpha if the background is transparent
     alpha: FloatArray | None  # [H, W] coverage by Gaussians, also where a background is behind them
-    depth: FloatArray | None  # [H, W] along the camera's axis, scene units, infinite where nothing was drawn
+    depth: FloatArray | None  # [H, W] along the camera's axis, world units, infinite where nothing was drawn
     motion: FloatArray | None  # [H, W, 2] displacement until t + dt, pixels to the right and down
     gaussians: FloatArray | None  # [H, W] number of Gaussians that contribute to each pixel
     plan: str  # how the scene's motion is computed

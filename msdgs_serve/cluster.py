@@ -4,8 +4,8 @@
     serve run msdgs_serve.cluster:application scenes=/data/scenes replicas=4 cores=8 queued_renders=32
 
 Arguments are the settings of `msdgs-serve`, the number of `replicas` and the `cores` per replica. If replicas run on
-several machines, all must be able to read the scenes. Ray's proxy handles the connections and replaces the settings
-host, port, header_seconds, read_seconds and drain_seconds.
+several machines, all must be able to read the scenes. Settings without effect are refused: Ray's proxy handles the
+connections, and Ray the logs.
 """
 
 import asyncio
@@ -25,6 +25,18 @@ MAX_REJECTIONS = 200
 `Retry-After`; Ray Serve would let them wait, or reject them without `Retry-After`."""
 
 
+WITHOUT_EFFECT = {
+    "threads": "`cores` is the number of threads of a replica",
+    "compile": "kernels are compiled when a replica starts",
+    **dict.fromkeys(("log_level", "log_format"), "Ray writes the logs"),
+    **dict.fromkeys(
+        ("host", "port", "header_seconds", "read_seconds", "drain_seconds", "unread_megabytes"),
+        "Ray's proxy handles the connections",
+    ),
+}
+"""Settings of `msdgs-serve`, and what replaces them."""
+
+
 def application(arguments: Mapping[str, str]) -> Any:
     """Return a Ray Serve application. Raises `InvalidInput` or pydantic's `ValidationError` naming the invalid
     argument."""
@@ -39,6 +51,8 @@ def read_arguments(arguments: Mapping[str, str]) -> tuple["Settings", int, int]:
     replicas, cores = (_count(name, given.pop(name, "1")) for name in ("replicas", "cores"))
     for name in given.keys() - Settings.model_fields.keys():
         raise InvalidInput(name, "left out, as there is no such setting", given[name])
+    for name in given.keys() & WITHOUT_EFFECT.keys():
+        raise InvalidInput(name, f"left out, as {WITHOUT_EFFECT[name]}", given[name])
     lists = {name: split_list(name, given[name]) for name in ("scenes", "cors_origins") if name in given}
     settings = Settings(**{**given, **lists, "threads": cores})
     if not settings.scenes:

@@ -44,11 +44,10 @@ class DeformationSession:
         Raises `SceneFileInvalid` naming the field if the file isn't a complete, finite scene.
         """
         self.path = Path(path)
-        self._file = self.path.name
         stored = self._read() if contents is None else memoryview(contents).toreadonly()
         with ThreadPoolExecutor(1) as beside:  # a second of the two that a file of 1 GB takes
             digest = beside.submit(hashlib.sha256, stored)
-            scene_file = read_scene_file(stored, self._file, limits or GraphLimits())
+            scene_file = read_scene_file(stored, self.path.name, limits or GraphLimits())
             self.sha256 = digest.result().hexdigest()
         constants = scene_file.aligned_constants(stored)
         del stored
@@ -114,7 +113,7 @@ class DeformationSession:
             if not error.field.startswith("gaussians."):
                 raise
             name = error.field.removeprefix("gaussians.")
-            raise SceneFileInvalid(self._file, name, f"can't be used at t = {t}: {error}") from error
+            raise SceneFileInvalid(self.path.name, name, f"can't be used at t = {t}: {error}") from error
 
     def _pose_selected(self, t: float, ids: npt.NDArray[np.int64] | None, steps: float | None) -> dict[str, FloatArray]:
         """Poses by a graph that selects the ids, chunk by chunk."""
@@ -126,7 +125,7 @@ class DeformationSession:
             for name, output in zip(posed, outputs, strict=True):
                 expected = posed[name][start:stop]
                 if output.shape != expected.shape:
-                    raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {expected.shape}")
+                    raise SceneFileInvalid(self.path.name, name, f"has shape {output.shape}, not {expected.shape}")
                 expected[:] = output
 
         run_parallel(run, [(i, min(i + self._chunk, len(every))) for i in range(0, len(every), self._chunk)])
@@ -141,7 +140,7 @@ class DeformationSession:
         for name, output in outputs.items():
             count, row = self.scene.moving_count, self._posed[name]
             if output.shape[1:] != tuple(row) or len(output) < count:
-                raise SceneFileInvalid(self._file, name, f"has shape {output.shape}, not {(count, *row)}")
+                raise SceneFileInvalid(self.path.name, name, f"has shape {output.shape}, not {(count, *row)}")
         return {name: output[rows] for name, output in outputs.items()}
 
     def _checked_ids(self, ids: npt.ArrayLike) -> npt.NDArray[np.int64]:
@@ -157,10 +156,10 @@ class DeformationSession:
         for name, array in posed.items():
             if name in APPEARANCE:
                 if problem := appearance_problem(name, array):
-                    raise SceneFileInvalid(self._file, name, f"{problem} at t = {t}")
+                    raise SceneFileInvalid(self.path.name, name, f"{problem} at t = {t}")
             elif not np.isfinite(array).all():
                 bad = int(np.count_nonzero(~np.isfinite(array).all(axis=1)))
-                raise SceneFileInvalid(self._file, name, f"is NaN or infinite for {bad:,} Gaussians at t = {t}")
+                raise SceneFileInvalid(self.path.name, name, f"is NaN or infinite for {bad:,} Gaussians at t = {t}")
 
     def _read(self) -> memoryview:
         try:
@@ -171,7 +170,7 @@ class DeformationSession:
                 contents = np.empty(status.st_size, np.uint8).data
                 return contents[: file.readinto(contents)]
         except OSError as error:
-            raise SceneFileInvalid(self._file, "file", f"can't be read: {error.strerror or error}") from error
+            raise SceneFileInvalid(self.path.name, "file", f"can't be read: {error.strerror or error}") from error
 
     def _read_scene(self, scene_file: SceneFile, constants: dict[str, np.ndarray]) -> BakedScene:
         arrays = dict(constants)
@@ -180,7 +179,7 @@ class DeformationSession:
             arrays |= zip(scene_file.computed, self._call(session, scene_file.computed, {}), strict=True)
         ordered = [arrays[name] for name in constant_outputs(scene_file.changing)]
         scene = BakedScene(scene_file.metadata, scene_file.moving_count, *ordered, changing=scene_file.changing)
-        return scene.validate(self._file)
+        return scene.validate(self.path.name)
 
     def _open(self, model: bytes, threads: int) -> ort.InferenceSession:
         options = ort.SessionOptions()
@@ -220,4 +219,4 @@ class DeformationSession:
         return [np.asarray(array) for array in arrays]
 
     def _runtime_error(self, problem: str, error: Exception) -> SceneFileInvalid:
-        return SceneFileInvalid(self._file, "file", f"{problem} by onnxruntime", str(error)[:_MAX_DETAILS])
+        return SceneFileInvalid(self.path.name, "file", f"{problem} by onnxruntime", str(error)[:_MAX_DETAILS])

@@ -36,6 +36,8 @@ from msdgs_serve.writing import in_words, replacing, write_text, writing
 
 PROGRAM = "msdgs-render"
 RECORD = "msdgs-render.json"
+DEFAULT_FRAMES, DEFAULT_ELEVATION = 60, 20.0
+"""Of a turn around the scene; the elevation in degrees."""
 OPTIONS = ("elevation", "width", "height", "region", "fps", "quality")
 """Those whose values are checked where they are used, by these names."""
 
@@ -95,9 +97,10 @@ def _parser() -> argparse.ArgumentParser:
 def _add_path_options(group: argparse._ArgumentGroup) -> None:
     path = "Camera path in nerfstudio's format; by default one turn around the scene during its time range."
     group.add_argument("--path", type=Path, metavar="JSON", help=path)
-    group.add_argument("--frames", type=int, default=60, metavar="COUNT", help="Frames of the turn. (default: 60)")
-    elevation = "Elevation of the turn above the horizon. (default: 20)"
-    group.add_argument("--elevation", type=float, default=20.0, metavar="DEGREES", help=elevation)
+    frames = f"Frames of the turn. (default: {DEFAULT_FRAMES})"
+    group.add_argument("--frames", type=int, metavar="COUNT", help=frames)
+    elevation = f"Elevation of the turn above the horizon. (default: {DEFAULT_ELEVATION:g})"
+    group.add_argument("--elevation", type=float, metavar="DEGREES", help=elevation)
     width = "Image width; by default the path's, else that of the scene's first camera."
     group.add_argument("--width", type=int, metavar="PIXELS", help=width)
     group.add_argument("--height", type=int, metavar="PIXELS", help="Image height, given together with --width.")
@@ -108,9 +111,7 @@ def _add_path_options(group: argparse._ArgumentGroup) -> None:
 def _add_output_options(group: argparse._ArgumentGroup) -> None:
     fps = f"Frames per second of a video; by default the path's, else {DEFAULT_FPS:g}."
     group.add_argument("--fps", type=float, help=fps)
-    group.add_argument(
-        "--format", choices=get_args(ImageFormat), default="png", help="Format of images. (default: png)"
-    )
+    group.add_argument("--format", choices=get_args(ImageFormat), help="Format of images. (default: png)")
     quality = f"Quality of jpeg and webp, 1 to 100. (default: {DEFAULT_QUALITY})"
     group.add_argument("--quality", type=int, metavar="NUMBER", help=quality)
     motion = "EXR and NPY also hold motion vectors, from each frame's time to this much later, in the scene's time."
@@ -127,8 +128,9 @@ def _run(options: argparse.Namespace) -> None:
             expected = f"a folder (of a name with a dot: an existing one), or a video named {names}"
             raise InvalidInput("OUT", expected, options.out.name)
         require_pyav(cast(VideoFormat, video))
+    _refuse(options, ["format"] if is_video else ["fps"], "for images" if is_video else "for a video")
     views, fps = _views(options)
-    image_format = cast(ImageFormat, "png" if is_video else options.format)
+    image_format = cast(ImageFormat, options.format or "png")
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
     if options.dt is not None and (is_video or not FORMATS[image_format].holds_float):
         raise InvalidInput("--dt", "left out, as only exr and npy hold motion vectors", options.dt)
@@ -160,10 +162,19 @@ def _run(options: argparse.Namespace) -> None:
         print("Some players, such as QuickTime, show MP4 of even sizes only; .webm and .webp have any size.")
 
 
+def _refuse(options: argparse.Namespace, names: Sequence[str], what: str) -> None:
+    """Raise `InvalidInput` for options that are given and have no effect, as they are for something else."""
+    for name in names:
+        if (value := getattr(options, name)) is not None:
+            raise InvalidInput(f"--{name}", f"left out: it is {what}", value)
+
+
 def _views(options: argparse.Namespace) -> tuple[list[View], float]:
     """Return all frames, and the frames per second of a video."""
     if (options.width is None) != (options.height is None):
         raise InvalidInput("--width", "given together with --height", "only one of them")
+    if options.scene.suffix == ".json" or options.path is not None:
+        _refuse(options, ["frames", "elevation"], "for a turn around the scene, not for a camera path")
     if options.scene.suffix == ".json":
         return _views_of_scenes(options)
     path = _path(options, _opened(options.scene, options))
@@ -195,13 +206,13 @@ def _path(options: argparse.Namespace, session: DeformationSession) -> CameraPat
         path = read_path_file(options.path, metadata.time_range, size)
         _print_warnings(options.path, path)
         return CameraPath(path.frames, _fps(options, path.fps))
-    if options.frames < 1:
-        raise InvalidInput("--frames", "at least 1", options.frames)
+    count = DEFAULT_FRAMES if options.frames is None else options.frames
+    if count < 1:
+        raise InvalidInput("--frames", "at least 1", count)
+    elevation = DEFAULT_ELEVATION if options.elevation is None else options.elevation
     view = framing(metadata)
     size = size or (view.width, view.height)
-    frames = orbit_path(
-        view.target, view.distance, options.elevation, view.up, view.fov_y, size, options.frames, metadata.time_range
-    )
+    frames = orbit_path(view.target, view.distance, elevation, view.up, view.fov_y, size, count, metadata.time_range)
     return CameraPath(tuple(frames), _fps(options, DEFAULT_FPS))
 
 

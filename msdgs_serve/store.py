@@ -255,6 +255,7 @@ class SceneStore:
                 except FileExistsError:  # another process was faster
                     raise _exists(name) from None
                 entry.tried = signature_of(target)
+                scene.session.path = target
                 entry.served = served = replaced(scene, signature=entry.tried)
                 entry.problem, entry.retry_at = None, math.inf
             self._make_room()

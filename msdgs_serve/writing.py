@@ -9,7 +9,7 @@ import fcntl
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -92,6 +92,33 @@ def write_text(path: Path, text: str) -> None:
     """Write text as UTF-8, atomically. Raises `WriteFailed`."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def move_all(moves: Sequence[tuple[Path, Path]]) -> None:
+    """Move files and folders from the first to the second path, in the same file system: all of them, or none."""
+    try:
+        for source, target in moves:
+            os.replace(source, target)
+    except BaseException:
+        for source, target in reversed(moves):
+            if not source.exists():
+                os.replace(target, source)
+        raise
+
+
+@contextmanager
+def made_folder(path: Path) -> Iterator[None]:
+    """Make a folder if there is none. It goes again if the block raises and leaves nothing in it."""
+    is_new = not path.exists()
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            with suppress(OSError):
+                path.rmdir()
+        raise
 
 
 @contextmanager

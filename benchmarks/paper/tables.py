@@ -98,9 +98,7 @@ class Trained:
     """What authors publish for the table's dataset, under an empty name, and what changes for scenes."""
 
 
-def read_systems(
-    table: Table, scenes: Sequence[Scene], budget: Budget, *, small: bool
-) -> dict[str, Trained]:
+def read_systems(table: Table, scenes: Sequence[Scene], budget: Budget, *, small: bool) -> dict[str, Trained]:
     """What is trained for each row on each scene."""
     definitions, published = _contents("systems"), {} if small else _contents("published")
     found = {}

@@ -11,7 +11,7 @@ from msdgs_export.importers.detect import TRAINED, input_format
 from msdgs_export.importers.scene import changed_metadata, note_left_out
 from msdgs_export.importers.splats.axes import up_direction
 from msdgs_export.jobs.command import export
-from msdgs_export.options import ExportOptions, require_folder_of
+from msdgs_export.options import ExportOptions, require_writable
 from msdgs_export.plans.registry import parse
 from msdgs_export.target import MIN_PSNR, check_min_psnr
 from msdgs_serve.scene.errors import InvalidInput
@@ -28,7 +28,9 @@ def export_or_import(options: ExportOptions, console: Console) -> None:
     """
     path, output = options.model, options.scene_file
     file_format = input_format(path, options.format)
-    require_folder_of("output", output)
+    require_writable("output", output, path)
+    if output.suffix != ".onnx":
+        raise InvalidInput("output", "named *.onnx", output.name)
     _check(options, file_format)
     if file_format in TRAINED:
         with trained_model(path, file_format, console) as (model, lost):

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from msdgs_export.command_line import Console, run, tyro
-from msdgs_export.options import require_folder_of
+from msdgs_export.options import require_writable
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.settings import optional
 
@@ -43,7 +43,8 @@ def main(
             raise InvalidInput("times", "2 or more", times)
         if not 0 < min_psnr < 100:
             raise InvalidInput("min_psnr", "between 0 and 100 dB", min_psnr)
-        require_folder_of("json", json)
+        if json is not None:
+            require_writable("json", json, model)
         with messages.status("loading torch and the kernels"):
             from msdgs_export.precision.show import assess_and_show  # slow to import: not before --help
         report = assess_and_show(model, times, min_psnr, json, messages)

@@ -20,7 +20,7 @@ from msdgs_export.importers.sequence import of_the_moment
 from msdgs_export.importers.splats.formats import read_splats
 from msdgs_export.jobs.packing import stored_anew
 from msdgs_export.jobs.write import set_properties, storage_differences, write_measured
-from msdgs_export.options import ConvertOptions, require_folder_of
+from msdgs_export.options import ConvertOptions, require_writable
 from msdgs_export.plans.registry import PLANS
 from msdgs_export.progress import tracked
 from msdgs_export.target import MIN_PSNR
@@ -31,7 +31,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.metadata import SceneMetadata
 from msdgs_serve.scene.similarity import Similarity
-from msdgs_serve.writing import replacing, temporary_folder, write_text
+from msdgs_serve.writing import made_folder, move_all, replacing, temporary_folder, write_text
 
 LOSSLESS, LOSSY = 60.0, 45.0
 """Default minimum PSNR of a written file against the scene, dB."""
@@ -43,6 +43,8 @@ USD = (".usdc", ".usda", ".usd")
 VIDEOS = (".mp4", ".webm")
 PLACEMENT = "placement.json"
 """Ending of the file that holds the `Similarity` from the positions of a written file to the world."""
+FRAMES = 30
+"""Default number of files in a folder, or frames of OpenUSD."""
 COMPARED = 5
 """Number of times at which a moving scene is compared."""
 
@@ -55,6 +57,10 @@ def convert(options: ConvertOptions, console: Console) -> None:
         write_site(DeformationSession(options.scene), options, console)
         return
     _refuse_options_of_sites(options)
+    if options.frames is not None and (options.t is not None or out.suffix in (*SINGLE, ONNX)):
+        raise InvalidInput("frames", "left out but for a folder of PLY files and OpenUSD, without --t", options.frames)
+    if options.frames is not None and options.frames < 2:
+        raise InvalidInput("frames", "2 or more", options.frames)
     if out.suffix in VIDEOS:
         raise InvalidInput("out", f"other than a video: msdgs-render {options.scene} {out} writes one", out.name)
     if out.name.lower().endswith(COMPRESSED):
@@ -62,7 +68,7 @@ def convert(options: ConvertOptions, console: Console) -> None:
             "out", "without .compressed: SuperSplat's compressed PLY isn't written, .spz is small", out.name
         )
     if out.suffix in (*SINGLE, *USD, ONNX):
-        require_folder_of("out", out)
+        require_writable("out", out, options.scene)
     if out.suffix == ONNX and options.t is not None:
         raise InvalidInput("t", "left out for a file that holds all times", options.t)
     session = DeformationSession(options.scene)
@@ -141,17 +147,15 @@ def _sequence(session: DeformationSession, options: ConvertOptions, console: Con
     if options.t is not None:
         raise InvalidInput("t", "left out for a folder; --frames is the number of files", options.t)
     out, times = options.out, _times(session, options)
-    out.mkdir(parents=True, exist_ok=True)
-    if any(each.suffix == ".ply" for each in out.iterdir()):
+    if out.is_dir() and any(each.suffix == ".ply" for each in out.iterdir()):
         raise InvalidInput("out", "a folder without PLY files", str(out))
     digits = len(str(len(times) - 1))
-    with temporary_folder(out, out) as folder:
+    with made_folder(out), temporary_folder(out, out) as folder:
         worst = min(
             _one(session, options, folder / f"{options.scene.stem}_{number:0{digits}}.ply", t)
             for number, t in track(list(enumerate(times)), "writing frames", console=console, transient=True)
         )
-        for file in sorted(folder.glob("*.ply")):
-            file.replace(out / file.name)
+        move_all([(file, out / file.name) for file in sorted(folder.glob("*.ply"))])
     return f"{len(times)} files, the worst {worst:.1f} dB"
 
 
@@ -187,9 +191,7 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
 
 
 def _times(session: DeformationSession, options: ConvertOptions) -> list[float]:
-    if options.frames < 2:
-        raise InvalidInput("frames", "2 or more", options.frames)
-    return np.linspace(*session.scene.metadata.time_range, options.frames).tolist()
+    return np.linspace(*session.scene.metadata.time_range, options.frames or FRAMES).tolist()
 
 
 def _visionary(session: DeformationSession, options: ConvertOptions, console: Console) -> str:

@@ -10,7 +10,7 @@ import onnx
 
 from msdgs_export.bake import Baked, Moving
 from msdgs_export.importers.placement import placement
-from msdgs_export.importers.splats.base import ROWS, Splats
+from msdgs_export.importers.splats.base import ROWS, UNUSABLE, Splats
 from msdgs_export.jobs.packing import stored_anew
 from msdgs_export.jobs.write import properties, set_properties, storage_differences, write_measured
 from msdgs_export.measure.poses import half_diagonal
@@ -65,7 +65,7 @@ def metadata_of(
     low, high = (tuple(float(v) for v in np.quantile(means, part, axis=0)) for part in WITHIN)
     left_out = ()
     if dropped:
-        what = "Gaussians with NaN, infinity or a quaternion without direction"
+        what = f"Gaussians with {UNUSABLE}"
         left_out = ({"rule": "unusable", "what": what, "count": dropped, "of": dropped + len(means)},)
     return SceneMetadata(
         contract=CONTRACT,

@@ -70,7 +70,8 @@ class Sweep:
         unvaried = [estimate for estimate in self._estimates if estimate.candidate.pruning_db == mildest]
         pairs = [pair for level in levels if level != mildest for pair in sorted(self._pairs(unvaried, level))]
         self._estimate_all("plans with pruning", pairs)
-        self._estimate_all("SH degree", self._degrees())
+        if "sh" in self._builder.pruning.rules:
+            self._estimate_all("SH degree", self._degrees())
         return self._measured()
 
     def _texts(self, fitted: bool) -> list[str]:

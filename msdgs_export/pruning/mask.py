@@ -120,7 +120,12 @@ def with_sh_degree(pruned: PrunedModel, sh_degree: int) -> PrunedModel:
     before = pruned.moving.config.sh_degree
     network = full_mask(pruned.moving).network
     static = rows(pruned.static, np.arange(len(pruned.static)), sh_degree)
-    entry = {"rule": "sh_degree", "what": "SH bands, as asked for", "count": before - sh_degree, "of": before}
+    entry = {
+        "rule": "sh_degree",
+        "what": "upper SH bands, within the error allowed",
+        "count": before - sh_degree,
+        "of": before,
+    }
     moving = _model(pruned.moving, network, slice(None), sh_degree)
     return PrunedModel(moving, static, pruned.ids, pruned.network, (*pruned.left_out, entry))
 

@@ -62,7 +62,7 @@ def _settings(arguments: Sequence[str]) -> Settings:
         settings = read_settings(arguments)
     except ValidationError as error:
         errors = [item for item in error.errors() if item["type"] != "default_factory_not_called"]  # follows another
-        wrong = [f"--{item['loc'][0]}: {item['msg']}".replace("_", "-") for item in errors]
+        wrong = [f"--{str(item['loc'][0]).replace('_', '-')}: {item['msg']}" for item in errors]
         raise UsageError("; ".join(wrong)) from None
     if not (settings.scenes or settings.compile):
         raise UsageError(f"no scene given; `{PROGRAM} scene.onnx` serves one, see `{PROGRAM} --help`")

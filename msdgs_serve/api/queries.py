@@ -24,6 +24,8 @@ def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:
         body["channels"] = given["channels"].split(",")
     if "region" in given:
         body["region"] = _numbers("region", given["region"], int)
+    if "depth_range" in given:
+        body["depth_range"] = _numbers("depth_range", given["depth_range"])
     if "background" in given:
         text = given["background"]
         body["background"] = _numbers("background", text) if "," in text else text

@@ -67,7 +67,7 @@ class MatrixCamera(Strict):
     )
     model: CameraModel = Field(
         default="pinhole",
-        description="`orthographic`: `fx` is in pixels per scene unit; `fisheye`: as in OpenCV",
+        description="`orthographic`: `fx` is in pixels per world unit; `fisheye`: as in OpenCV",
     )
     distortion: tuple[Number, Number, Number, Number] = Field(
         default=(0.0, 0.0, 0.0, 0.0), description="k1 to k4 of a `fisheye` camera"
@@ -98,7 +98,7 @@ class OrbitCamera(Strict):
     azimuth: Number = Field(description="degrees around `up`")
     elevation: Elevation = Field(description="degrees above the horizon of `target`")
     distance: Distance | None = Field(
-        default=None, description="scene units; default: the median of the scene's cameras"
+        default=None, description="world units; default: the median of the scene's cameras"
     )
     target: Vector | None = Field(default=None, description="world; default: the scene's", examples=[[0, 0, 0]])
     up: Direction | None = Field(default=None, description="world; default: the scene's", examples=[[0, 0, 1]])
@@ -178,7 +178,7 @@ class RenderRequest(Strict):
     format: ImageFormat = Field(
         default="png",
         description="`png`: 8-bit sRGB. `jpeg`, `webp`: the same, lossy. `exr`: 32-bit float scene-linear Rec.709 "
-        "R G B A, premultiplied, and depth Z along the camera axis in scene units, infinite in empty pixels. `npy`: "
+        "R G B A, premultiplied, and depth Z along the camera axis in world units, infinite in empty pixels. `npy`: "
         "a NumPy array [H, W, C], float32, as rendered: sRGB-encoded color, premultiplied if transparent",
     )
     channels: Channels | None = Field(
@@ -228,12 +228,13 @@ class RenderQuery(BaseModel):
     format: ImageFormat = Field(default="png", description="as in `POST /render`")
     quality: LaxQuality | None = Field(default=None, description="quality of `jpeg` and `webp`")
     channels: List | None = Field(default=None, examples=["depth"])
+    depth_range: List | None = Field(default=None, description="as in `POST /render`", examples=["1,9"])
     background: List | None = Field(default=None, description="`scene`, `transparent` or `r,g,b`", examples=["1,1,1"])
     camera: Name | None = Field(default=None, description="name of a camera of the scene")
     index: LaxIndex | None = Field(default=None, description="index of a camera of the scene")
     azimuth: LaxNumber | None = Field(default=None, description="degrees; default 30")
     elevation: LaxNumber | None = Field(default=None, description="degrees; default 20")
-    distance: LaxNumber | None = Field(default=None, description="scene units")
+    distance: LaxNumber | None = Field(default=None, description="world units")
     eye: List | None = Field(default=None, examples=["4,0,1"])
     target: List | None = Field(default=None, examples=["0,0,0"])
     up: List | None = Field(default=None, examples=["0,0,1"])
@@ -315,7 +316,7 @@ class SceneView(BaseModel):
     """The scene's default view; OpenCV axes."""
 
     target: tuple[float, float, float] = Field(description="point that the camera looks at, world")
-    distance: float = Field(description="distance from the target, scene units")
+    distance: float = Field(description="distance from the target, world units")
     up: tuple[float, float, float] = Field(description="up direction, world, of length 1")
     fov_y: float = Field(description="vertical field of view, degrees")
     width: int = Field(description="pixels")

@@ -19,7 +19,7 @@ class Image:
 
     rgb: FloatArray  # [H, W, 3] sRGB-encoded, >= 0
     alpha: FloatArray  # [H, W] coverage by Gaussians in [0, 1]
-    depth: FloatArray | None = None  # [H, W] along the camera axis, scene units; infinite if alpha is 0
+    depth: FloatArray | None = None  # [H, W] along the camera axis, world units; infinite if alpha is 0
     transparent: bool = False
     camera: Camera | None = None  # for formats that store it
     t: float | None = None  # scene time

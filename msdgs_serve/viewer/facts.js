@@ -58,7 +58,7 @@ function largestError({ measured_error: { rendered, position, means }, left_out:
   const ofParts = parts.map((part) => part?.worst_frame_db).filter(Number.isFinite);
   const psnr = rendered?.psnr_worst ?? (ofParts.length ? Math.min(...ofParts) : null);
   if (Number.isFinite(psnr)) return `${decibels(psnr)} in the worst frame`;
-  if (Number.isFinite(position)) return position ? `at most ${plain(position)} scene units` : "none";
+  if (Number.isFinite(position)) return position ? `at most ${plain(position)} world units` : "none";
   if (Number.isFinite(means)) return means ? `at most ${plain(100 * means)} % of the scene’s size` : "none";
   return "";
 }

@@ -1,6 +1,6 @@
 // The time slider and its buttons, for scenes that change with time.
 
-import { plain } from "./numbers.js";
+import { inRange, plain } from "./numbers.js";
 import { SPEEDS } from "./player.js";
 
 export class Timeline {
@@ -60,8 +60,7 @@ export class Timeline {
   /** The time with as many digits as tell a thousandth of the range. */
   #text() {
     const [first, last] = this.player.range;
-    const digits = 3 - Math.floor(Math.log10(last - first || 1));
-    return `t ${this.player.t.toFixed(Math.min(Math.max(digits, 0), 12))}`;
+    return `t ${inRange(this.player.t, last - first)}`;
   }
 
   #set() {

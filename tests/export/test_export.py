@@ -16,6 +16,7 @@ from rich.console import Console
 
 from msdgs_export.bake import bake, starting_cameras
 from msdgs_export.cli.export import export_or_import
+from msdgs_export.cli.stability import main as stability
 from msdgs_export.cli.to_onnx import main as to_onnx
 from msdgs_export.exporters.command import convert
 from msdgs_export.jobs.verify import VerificationFailed, verify
@@ -361,6 +362,23 @@ def test_a_folder_is_no_output_file(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (tmp_path / f"out{suffix}").mkdir()
         with pytest.raises(InvalidInput, match="`out` must be a file, not a folder"):
             convert(ConvertOptions(scene_file, tmp_path / f"out{suffix}"), Console())
+
+
+def test_what_is_read_is_not_overwritten(tmp_path: Path, scene_file: Path):
+    model, scene = tmp_path / "model.pt", tmp_path / "scene.onnx"
+    model.write_bytes(b"model")
+    scene.write_bytes(scene_file.read_bytes())
+    (tmp_path / "link.onnx").symlink_to(model)
+    for output in (model, tmp_path / "link.onnx"):
+        with pytest.raises(InvalidInput, match="`output` must be another file than the one that is read"):
+            export_or_import(ExportOptions(model, output, format="model"), Console())
+    with pytest.raises(InvalidInput, match=r"`output` must be named \*\.onnx, got scene"):
+        export_or_import(ExportOptions(model, tmp_path / "scene", format="model"), Console())
+    with pytest.raises(InvalidInput, match="`out` must be another file"):
+        convert(ConvertOptions(scene, tmp_path / "." / scene.name), Console())
+    assert stability(model, json=model) == EXIT_INVALID
+    assert model.read_bytes() == b"model"
+    assert scene.read_bytes() == scene_file.read_bytes()
 
 
 @pytest.mark.parametrize(

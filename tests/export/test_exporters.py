@@ -53,8 +53,8 @@ def scene_file(folder: Path, plan: str = "network", info: SceneInfo = SCENE, **c
     return file
 
 
-def run(scene: Path, out: Path, t: float | None = None, frames: int = 30, min_psnr: float | None = None) -> None:
-    convert(ConvertOptions(scene, out, t, frames, min_psnr), QUIET)
+def run(scene: Path, out: Path, t: float | None = None, **options: Any) -> None:
+    convert(ConvertOptions(scene, out, t, **options), QUIET)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -105,7 +105,7 @@ def test_an_interrupted_sequence_leaves_no_file(tmp_path: Path, monkeypatch: pyt
         with pytest.raises(KeyboardInterrupt):
             run(scene, tmp_path / "frames", frames=4)
     assert len(written) == 2
-    assert list((tmp_path / "frames").iterdir()) == []
+    assert not (tmp_path / "frames").exists()
     run(scene, tmp_path / "frames", frames=4)
     assert len(list((tmp_path / "frames").iterdir())) == 4
 
@@ -265,7 +265,25 @@ def test_on_a_full_disk_no_frame_of_a_sequence_stays(tmp_path: Path):
     scene, out = scene_file(tmp_path), tmp_path / "frames"
     with pytest.raises(WriteFailed, match=f"^{out}: can't be written: "), largest_file(2000):
         run(scene, out, frames=2)
-    assert not os.listdir(out)
+    assert not out.exists()
+
+
+def test_frames_that_were_moved_go_back_if_others_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    scene, out, replace = scene_file(tmp_path), tmp_path / "frames", os.replace
+
+    def interrupted(source: Path, target: Path) -> None:
+        if target.name.endswith("_1.ply") and target.parent == out:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, out, frames=3)
+    assert not out.exists()
+    with pytest.raises(ConversionFailed):
+        run(scene, out, frames=2, min_psnr=99.5)
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("of", ["network", "sequence"])
@@ -385,6 +403,9 @@ def test_an_option_without_effect_and_a_missing_folder_are_refused(tmp_path: Pat
     scene = scene_file(tmp_path, "network")
     with pytest.raises(InvalidInput, match=r"`t` must be left out for a file that holds all times, got 0\.5"):
         run(scene, tmp_path / "b.onnx", 0.5)
+    for out, t in (("a.ply", None), ("b.onnx", None), ("a.usdc", 0.5)):
+        with pytest.raises(InvalidInput, match="`frames` must be left out but for a folder of PLY files and OpenUSD"):
+            run(scene, tmp_path / out, t, frames=9)
     with pytest.raises(InvalidInput, match="`out` must be in a folder that exists"):
         run(scene, tmp_path / "nowhere" / "a.ply")
 

@@ -315,7 +315,8 @@ def test_one_command_writes_scene_and_report(tmp_path: Path, capsys: pytest.Capt
     # the fastest of such small files is random
     still = scene.moving_count < len(moving_object().gaussians)
     assert ("left out: motion of Gaussians that never move visibly" in shown) == still
-    assert scene.metadata.sh_degree == 1 or "sh_degree" in {entry["rule"] for entry in scene.metadata.left_out}
+    assert scene.metadata.sh_degree == moving_object().config.sh_degree
+    assert {"sh", "sh_degree"}.isdisjoint(entry["rule"] for entry in scene.metadata.left_out)
     assert scene.metadata.measured_error["rendered"]["psnr_worst"] >= 45
     contents = json.loads((tmp_path / "model.report.json").read_text())
     chosen = next(p for p in contents["points"] if p["chosen"])

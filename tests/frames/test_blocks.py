@@ -99,6 +99,23 @@ def test_motion_that_cannot_be_is_refused_before_drawing(
     assert not (folder / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("scene", "out", "option", "value"),
+    [
+        ("views.json", "out", "--frames", "3"),
+        ("views.json", "out", "--elevation", "3"),
+        ("one.onnx", "out.mp4", "--format", "exr"),
+        ("one.onnx", "out", "--fps", "24"),
+    ],
+)
+def test_options_without_effect_are_refused(
+    folder: Path, scene: str, out: str, option: str, value: str, capsys: pytest.CaptureFixture[str]
+):
+    assert main([str(folder / scene), str(folder / out), option, value]) == 2
+    assert f"`{option}` must be left out: it is for" in capsys.readouterr().err
+    assert not (folder / out).exists()
+
+
 @pytest.mark.parametrize("fps", ["nan", "0", "-1"])
 def test_frames_per_second_that_cannot_be_are_refused_before_drawing(
     folder: Path, fps: str, capsys: pytest.CaptureFixture[str]

@@ -184,6 +184,7 @@ def test_a_scene_that_is_added_hides_none_of_other_folders(
     (tmp_path / "ours").mkdir()
     store = SceneStore([folder, tmp_path / "ours"])
     added = store.add("walk", write_scene(store.incoming("token")))
+    assert added.session.path.name == "walk.onnx"  # which errors of later poses name
     assert store.get("walk") is added
     ours = write_scene(tmp_path / "ours" / "walk.onnx", plan="prefix:1")
     store.refresh()

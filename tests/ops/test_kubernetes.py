@@ -67,6 +67,19 @@ def test_the_services_settings_are_known():
     assert render["livenessProbe"]["httpGet"]["path"] == "/live"
 
 
+def test_only_the_proxy_and_prometheus_reach_replicas():
+    """As they believe what `X-Forwarded-For` says."""
+    rules, pods = found("NetworkPolicy", "msdgs-render")["spec"], found("Deployment", "msdgs-render")["spec"]
+    assert rules["podSelector"] == pods["selector"]
+    assert rules["policyTypes"] == ["Ingress"]
+    (rule,) = rules["ingress"]
+    proxy, prometheus = rule["from"]
+    assert proxy["podSelector"] == found("Deployment", "msdgs-proxy")["spec"]["selector"]
+    assert prometheus["podSelector"] == {"matchLabels": {"app.kubernetes.io/name": "prometheus"}}
+    (port,) = rule["ports"]
+    assert port["port"] in {each["name"] for each in container("msdgs-render")["ports"]}
+
+
 def test_the_autoscaler_reads_a_metric_of_the_service():
     (metric,) = found("HorizontalPodAutoscaler", "msdgs-render")["spec"]["metrics"]
     name = metric["pods"]["metric"]["name"]

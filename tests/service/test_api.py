@@ -99,6 +99,11 @@ def test_a_region_is_a_part_of_the_image(client: httpx.Client):
     link = f"/render?azimuth=0&elevation=0&distance=5&fov_y=40&width={SIZE}&height={SIZE}&region=11,20,37,30"
     np.testing.assert_array_equal(decode(client.get(link).content, "png")[0], part(render(client)))
     check_problem(client.get(f"{link[:-1]}x"), 422, "region")
+    depths = {**FRAME, "channels": ["depth"], "depth_range": [3, 6], "region": region}
+    link += "&channels=depth&depth_range="
+    assert client.get(f"{link}3,6").content == client.post("/render", json=depths).content
+    for wrong in ("6,3", "3", "a,b"):
+        check_problem(client.get(f"{link}{wrong}"), 422, "depth_range")
 
 
 def test_parts_of_an_image_beyond_the_limit_of_pixels_are_drawn(client: httpx.Client):

@@ -114,7 +114,8 @@ def test_a_batch_keeps_no_scenes_in_memory(tmp_path: Path):
 
 def test_the_same_as_parts(client: httpx.Client):
     frames = [{**FRAME, "scene": "red"}, {**FRAME, "scene": "red", "t": 7}, {**FRAME, "scene": "blue"}]
-    response = client.post("/render/batch", json={"frames": frames}, headers={"Accept": "multipart/mixed"})
+    accept = "application/x-ndjson; q=0.5, Multipart/Mixed"
+    response = client.post("/render/batch", json={"frames": frames}, headers={"Accept": accept})
     head = f"Content-Type: {response.headers['Content-Type']}\r\n\r\n".encode()
     message = email.message_from_bytes(head + response.content, policy=email.policy.HTTP)
     parts = {int(str(part["Msdgs-Index"])): part for part in message.iter_parts()}  # pyright: ignore
@@ -123,3 +124,12 @@ def test_the_same_as_parts(client: httpx.Client):
     assert parts[2].get_payload(decode=True) == alone.content
     assert parts[2]["ETag"] == alone.headers["ETag"]
     assert parts[1].get_content_type() == "application/problem+json"
+
+
+@pytest.mark.parametrize(
+    "accept",
+    ["", "*/*", "multipart/mixed;q=0", "multipart/mixed; q=0.000, */*", "multipart/mixed;q=0.1, application/x-ndjson"],
+)
+def test_lines_unless_parts_are_wanted(client: httpx.Client, accept: str):
+    response = client.post("/render/batch", json={"frames": [{**FRAME, "scene": "red"}]}, headers={"Accept": accept})
+    assert response.headers["Content-Type"] == "application/x-ndjson"

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from msdgs_serve.cluster import read_arguments
+from msdgs_serve.cluster import WITHOUT_EFFECT, read_arguments
 from msdgs_serve.scene import InvalidInput
 
 
@@ -26,6 +26,7 @@ def test_arguments_are_settings_replicas_and_cores():
         ({"scenes": "/a", "queued_render": "3"}, "queued_render"),
         ({"scenes": "/a", "replicas": "many"}, "replicas"),
         ({"scenes": "/a", "cores": "0"}, "cores"),
+        *(({"scenes": "/a", name: "8"}, name) for name in WITHOUT_EFFECT),
     ],
 )
 def test_a_wrong_argument_is_named(arguments: dict[str, str], name: str):

@@ -5,6 +5,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import onnx
@@ -179,6 +180,28 @@ def test_a_service_writes_no_file_besides_its_scenes(tmp_path: Path, folder: Pat
     run_python(SERVICE % FRAME, folder, scene, PYTHONDONTWRITEBYTECODE="1", **dict.fromkeys(PLACES, str(home)))
     assert list(home.rglob("*")) == []
     assert [path.name for path in folder.rglob("*")] == ["walk.onnx"]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"checkpoint_sha256": "1" * 64},
+        {"points": [{"plan": "prefix:1", "error": {"psnr_worst": 50.0}, "chosen": True}]},
+        {"points": [{"plan": "network", "error": {"psnr_worst": 51.0}, "chosen": True}]},
+        {"points": [{"plan": "network", "error": {"psnr_worst": 50.0}, "chosen": False}]},
+        {"points": "network"},
+    ],
+)
+def test_a_report_of_another_file_is_not_that_of_the_scene(tmp_path: Path, changes: dict[str, Any]):
+    error = {"psnr_worst": 50.0}
+    write_scene(tmp_path / "good.onnx", measured_error={"rendered": error})
+    points = [{"plan": "network", "error": error, "chosen": True}]
+    report: dict[str, Any] = {"format": "msdgs-report/1", "checkpoint_sha256": "0" * 64, "points": points}
+    (tmp_path / "good.report.json").write_text(json.dumps(report | changes))
+    with serving(tmp_path) as client:
+        assert client.get("/scenes/good").json()["report"] == (not changes)
+        assert client.get("/scenes/good/report").status_code == (404 if changes else 200)
 
 
 @pytest.mark.parametrize("milliseconds", [f"1{'0' * 400}", "1e999", "[" * 100_000 + "]" * 100_000])

@@ -42,8 +42,11 @@ CHANGES = {"date", "x-request-id", "server-timing"}
 @pytest.fixture(scope="module")
 def client(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     folder = tmp_path_factory.mktemp("scenes")
-    write_scene(folder / "balls.onnx")
-    (folder / "balls.report.json").write_text(json.dumps({"format": "msdgs-report/1", "checkpoint_sha256": SHA256}))
+    error = {"psnr_worst": 60.0}
+    write_scene(folder / "balls.onnx", measured_error={"rendered": error})
+    points = [{"chosen": True, "plan": "network", "error": error}]
+    report = {"format": "msdgs-report/1", "checkpoint_sha256": SHA256, "points": points}
+    (folder / "balls.report.json").write_text(json.dumps(report))
     with serving(folder) as client:
         yield client
 

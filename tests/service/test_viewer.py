@@ -42,7 +42,9 @@ REPORT = {
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes")
-    write_scene(folder / "balls.onnx", steps=True)
+    chosen = next(point for point in REPORT["points"] if point["chosen"])
+    described = {"plan": chosen["plan"], "measured_error": {"rendered": chosen["error"]}}
+    write_scene(folder / "balls.onnx", steps=True, **described)
     write_scene(folder / "it's.onnx", static_color=(0.0, 0.0, 1.0), moving=0)
     (folder / "balls.report.json").write_text(json.dumps(REPORT))
     return folder
@@ -277,6 +279,17 @@ def test_the_report_is_drawn(opened: Page):
     assert opened.locator("#report-point").inner_text().startswith("Chosen: prefix")
     dots.last.focus()
     assert "95.0 dB" in opened.locator("#report-point").inner_text()
+    assert opened.locator("#diagram").get_by_text("allowed: 50 dB").is_visible()
+
+
+def test_a_report_of_limited_bytes_has_no_line_of_allowed_error(page: Page, client: httpx.Client):
+    answer = json.dumps(REPORT | {"min_psnr": None})
+    page.route("**/report", lambda route: route.fulfill(body=answer, content_type="application/json"))
+    open_page(page, client)
+    page.locator("#diagram .dot").last.wait_for()
+    heights = [float(dot.get_attribute("cy") or "nan") for dot in page.locator("#diagram .dot").all()]
+    assert abs(heights[0] - heights[1]) > 100  # over the whole axis
+    assert page.locator("#diagram").get_by_text("allowed").count() == 0
 
 
 def test_the_frame_as_a_command_and_as_files(browser: Browser, client: httpx.Client):

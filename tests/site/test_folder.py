@@ -332,6 +332,13 @@ def test_its_options_are_for_sites_only(tmp_path: Path, scene: Path, option: dic
         convert(ConvertOptions(scene, tmp_path / "a.ply", **option), Console(quiet=True))
 
 
+@pytest.mark.parametrize("option", [{"t": 0.5}, {"frames": 9}, {"min_psnr": 60.0}])
+def test_options_of_other_formats_are_refused(tmp_path: Path, scene: Path, option: dict[str, Any]):
+    (name,) = option
+    with pytest.raises(InvalidInput, match=f"`{name}` must be left out for a site"):
+        convert(ConvertOptions(scene, tmp_path / "site", site=True, **option), Console(quiet=True))
+
+
 def test_a_folder_without_the_runtime_is_refused(tmp_path: Path, scene: Path, runtime: Path):
     (runtime / WASM).unlink()
     with pytest.raises(InvalidInput, match=f"{WASM} can't be read"):

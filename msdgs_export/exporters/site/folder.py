@@ -2,9 +2,7 @@
 
 import gzip
 import json
-import os
 import shlex
-from contextlib import suppress
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -21,7 +19,7 @@ from msdgs_serve.imaging import encode
 from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene.camera import Camera, orbit
 from msdgs_serve.scene.errors import InvalidInput
-from msdgs_serve.writing import PREFIX, temporary_folder
+from msdgs_serve.writing import PREFIX, made_folder, move_all, temporary_folder
 
 FORMAT = "msdgs-site/1"
 DESCRIPTION = "scene.json"
@@ -41,20 +39,14 @@ def write_site(session: DeformationSession, options: ConvertOptions, console: Co
     `RuntimeMissing` and `WriteFailed`.
     """
     out = options.out
-    if options.t is not None:
-        raise InvalidInput("t", "left out for a site, which shows all times", options.t)
+    for name in ("t", "frames", "min_psnr"):
+        if getattr(options, name) is not None:
+            raise InvalidInput(name, "left out for a site, which holds the scene itself", getattr(options, name))
     text = _text(session, options)
     replaced = _replaceable(out)
     files = _files(session, options, text, site_runtime(options.onnxruntime_web, console))
-    is_new = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)
-    try:
+    with made_folder(out):
         _replace(out, replaced, files)
-    except BaseException:
-        if is_new:
-            with suppress(OSError):
-                out.rmdir()
-        raise
     _tell(out, text, files, console)
 
 
@@ -69,15 +61,7 @@ def _replace(out: Path, replaced: set[str], files: dict[str, bytes]) -> None:
         for path, contents in files.items():
             (new / path).parent.mkdir(parents=True, exist_ok=True)
             (new / path).write_bytes(contents)
-        moves = [(out / name, old / name) for name in replaced] + [(path, out / path.name) for path in new.iterdir()]
-        try:
-            for source, target in moves:
-                os.replace(source, target)
-        except BaseException:
-            for source, target in reversed(moves):
-                if not source.exists():
-                    os.replace(target, source)
-            raise
+        move_all([(out / name, old / name) for name in replaced] + [(path, out / path.name) for path in new.iterdir()])
 
 
 def _text(session: DeformationSession, options: ConvertOptions) -> PageText:

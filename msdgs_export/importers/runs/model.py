@@ -20,7 +20,7 @@ from msdgs_export.importers.runs.grid4d import Grid4DImporter
 from msdgs_export.importers.runs.scgs import SCGSImporter
 from msdgs_export.importers.runs.state import RunFolder, stores
 from msdgs_export.importers.scene import metadata_of
-from msdgs_export.importers.splats.base import Splats, as_float32, logit
+from msdgs_export.importers.splats.base import UNUSABLE, Splats, as_float32, logit
 from msdgs_export.importers.splats.formats import read_splats, refuse_pointer
 from msdgs_export.measure.poses import posed
 from msdgs_serve.scene.camera import Camera
@@ -75,7 +75,7 @@ def write_model(run: Path, file_format: str, output: Path, console: Console) -> 
     for warning in source.warnings:
         console.print(f"warning: {warning}", markup=False)
     if source.dropped:
-        raise ImportFailed(clouds[iteration], f"{source.dropped:,} Gaussians hold NaN, infinity or no direction")
+        raise ImportFailed(clouds[iteration], f"{source.dropped:,} Gaussians have {UNUSABLE}")
     if source.motion is not None:
         raise ImportFailed(clouds[iteration], "has Gaussians that move by themselves, unlike those of such a run")
     folder = RunFolder(run, iteration, importer.networks)

@@ -21,6 +21,9 @@ MAX_DISTANCE = 1e12
 MAX_SH = 1e4
 """Largest SH coefficient; usual ones are below 10."""
 
+UNUSABLE = "NaN, infinity, a quaternion without direction, an SH coefficient above 10⁴ or a center beyond 10¹²"
+"""For any of these a Gaussian is left out."""
+
 
 MIN_LOGIT_DISTANCE = 1e-7
 """Distance of opacities from 0 and 1, which have no finite logit. No pixel of 8 bits differs by it."""
@@ -34,7 +37,7 @@ class Splats:
     """The Gaussians of one file, float32, in its own order and axes."""
 
     gaussians: Gaussians
-    dropped: int = 0  # had NaN, infinity or a quaternion without direction, and are not in `gaussians`
+    dropped: int = 0  # had `UNUSABLE` values, and are not in `gaussians`
     antialiasing: str = "dilate"  # or "mip", if the file says so
     quat_lengths: FloatArray | None = None  # [N] of the stored quaternions; None: all 1
     warnings: tuple[str, ...] = ()  # what a user should know about the file, each one sentence

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import re
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing
 from dataclasses import dataclass, field, replace
@@ -67,9 +68,19 @@ async def render_batch(
     """
     if len(body.frames) > service.settings.max_batch:
         raise InvalidInput("frames", f"at most {service.settings.max_batch}", len(body.frames))
-    multipart = MULTIPART in (accept or "")
+    multipart = 0 < _weight(accept or "", MULTIPART) >= _weight(accept or "", NDJSON)
     media_type = f"{MULTIPART}; boundary={BOUNDARY}" if multipart else NDJSON
     return StreamingResponse(_written(service, body.frames, multipart), media_type=media_type)
+
+
+def _weight(accept: str, media_type: str) -> float:
+    """The weight that a header `Accept` gives a media type (RFC 9110, section 12.4.2); 0 if it doesn't name it."""
+    for entry in accept.lower().split(","):
+        name, *parameters = (part.strip() for part in entry.split(";"))
+        if name == media_type:
+            weight = next((text[2:] for text in parameters if text.startswith("q=")), "1")
+            return float(weight) if re.fullmatch(r"[01](\.\d{0,3})?", weight) else 0.0
+    return 0.0
 
 
 async def _written(service: Service, frames: list[dict[str, Any]], multipart: bool) -> AsyncIterator[bytes]:

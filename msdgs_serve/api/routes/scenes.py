@@ -27,7 +27,7 @@ from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.uploads import Stored
 from msdgs_serve.description import described
 from msdgs_serve.scene import InvalidInput, SceneFileInvalid
-from msdgs_serve.scene_report import read_report, report_path
+from msdgs_serve.scene_report import has_report, read_report
 from msdgs_serve.store import SceneStatus, SceneStore
 
 MAX_REASON = 300
@@ -57,9 +57,8 @@ def describe_scene(name: SceneName, service: SharedService) -> SceneDetail:
 @router.get("/scenes/{name}/report", summary="Error against run time", responses=problems(404, 422, 503))
 def scene_report(name: SceneName, service: SharedService) -> dict[str, Any]:
     """The exporter's measurements of the plans for this scene: the `.report.json` beside its file, in the format
-    `msdgs-report/1`. 404 if there is none, or if it belongs to another model."""
-    served = service.store.get(name)
-    report = read_report(service.store.file(name), served.session.scene.metadata.checkpoint_sha256)
+    `msdgs-report/1`. 404 if there is none, or if it is of another file."""
+    report = read_report(service.store.file(name), service.store.get(name).session.scene.metadata)
     if report is None:
         raise RequestRejected(HTTPStatus.NOT_FOUND, "not_found", "There is no report for this scene.")
     return report
@@ -188,7 +187,7 @@ def _describe(store: SceneStore, name: str) -> SceneDetail:
         **_problem(status),
         name=name,
         loaded=status.loaded,
-        report=report_path(store.file(name)).is_file(),
+        report=has_report(store.file(name), served.session.scene.metadata),
         cost=GraphCost.model_validate(served.session.cost, from_attributes=True),
     )
 

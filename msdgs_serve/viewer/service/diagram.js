@@ -19,13 +19,14 @@ const KINDS = ["network", "prefix", "compact"];
 export function drawDiagram(svg, report, tell) {
   const points = report.points.map(pointOf).sort((a, b) => a.milliseconds - b.milliseconds);
   const across = scale(points.map((point) => Math.log(point.milliseconds)), [LEFT + 8, WIDTH - RIGHT - 8]);
-  const upwards = scale([...points.map((point) => point.psnr), report.min_psnr], [TOP + 8, HEIGHT - BOTTOM - 8]);
+  const limits = report.min_psnr === null ? [] : [report.min_psnr]; // none if only bytes are limited
+  const upwards = scale([...points.map((point) => point.psnr), ...limits], [TOP + 8, HEIGHT - BOTTOM - 8]);
   const x = (milliseconds) => across(Math.log(milliseconds));
   svg.setAttribute("viewBox", `0 0 ${WIDTH} ${HEIGHT}`);
   svg.replaceChildren(
     ...timeAxis(points, x),
     ...errorAxis(points, upwards),
-    ...allowed(report.min_psnr, upwards(report.min_psnr)),
+    ...limits.flatMap((db) => allowed(db, upwards(db))),
     frontLine(points, x, upwards),
     ...points.map((point) => dot(point, x(point.milliseconds), upwards(point.psnr), tell)),
   );
