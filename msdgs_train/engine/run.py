@@ -111,27 +111,34 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
     require_device(config.run.device)
     if tensorboard:
         require_tensorboard()
-    stored, earlier = (stored_config(folder), read_record(folder)) if resume else (None, None)
-    if stored:
-        check_resumable(stored, config)
+    if resume:
+        stored_config(folder)
     else:
         require_no_run(folder)
     with contextlib.ExitStack() as on_error:
-        lock = on_error.enter_context(_locked(folder)) if stored else None
+        lock = on_error.enter_context(_locked(folder)) if resume else None
+        stored, earlier = (stored_config(folder), read_record(folder)) if resume else (None, None)
+        if stored:
+            check_resumable(stored, config)
         d = config.data
         scene = load_scene(data, d.size, d.llffhold, d.time_from, d.masks)
         dataset = identity(scene)
         if earlier:
             require_same_dataset(folder, earlier, data, dataset)
-        scene = scene.in_frame(earlier.scene_to_world) if earlier else scene.normalized()
+        scene = scene.normalized()
+        if earlier:
+            scene = scene.in_frame(earlier.scene_to_world)
         trainer = Trainer(config, scene)
         continues = resume and (folder / CHECKPOINT).exists()
         seconds = trainer.load_checkpoint(folder / CHECKPOINT) if continues else 0.0
         if stored:
-            require_same_phase(Schedule.from_config(stored), Schedule.from_config(config), trainer.step_count)
+            before, milestones = Schedule.from_config(stored), trainer.system.milestones
+            require_same_phase(before, trainer.schedule, trainer.reached, milestones)
             if trainer.step_count >= config.run.steps and stored.run.minutes != config.run.minutes:
                 raise InvalidInput("config.minutes", "unchanged, as the run is finished", config.run.minutes)
-        lock = lock or on_error.enter_context(_locked(folder))
+        if lock is None:
+            lock = on_error.enter_context(_locked(folder))
+            require_no_run(folder)  # another process may have trained there until now
         remove_temporaries(folder)
         write_config(folder, config)
         best = _best_so_far(folder, earlier, scene) if earlier else None

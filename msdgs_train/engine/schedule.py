@@ -1,5 +1,6 @@
 """The phases of a run in steps, and everything that depends on the step."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 from msdgs_serve.scene.errors import InvalidInput
@@ -153,11 +154,23 @@ class Schedule(NamedTuple):
         return self.ema_steps > 0 and step > last
 
 
-def require_same_phase(before: Schedule, after: Schedule, step: int) -> None:
-    """Raise `InvalidInput` unless a run that has taken `step` steps can go on with another number of them: layers are
-    initialized where motion begins and where the time window grows, and trained bands of color stay in use."""
-    moved = (before.deforms(step), before.window(step)) != (after.deforms(step), after.window(step))
-    if moved or after.sh_degree(step) < before.sh_degree(step):
+def require_same_phase(
+    before: Schedule, after: Schedule, reached: range, milestones: Callable[[int], list[int]]
+) -> None:
+    """Raise `InvalidInput` unless a run can go on with another number of steps: layers are initialized where motion
+    begins and where the time window grows, and trained bands of color stay in use.
+
+    Args:
+        reached: steps, counted from 1, of the last optimizer step; what begins at them hasn't happened yet.
+        milestones: `System.milestones`.
+    """
+    step = reached.stop - 1
+
+    def passed(schedule: Schedule, step: int) -> list[bool]:
+        return [schedule.deforms(step), *(at <= step for at in milestones(schedule.num_steps))]
+
+    moved = any(passed(before, edge) != passed(after, edge) for edge in (reached.start - 1, step))
+    if moved or before.window(step) != after.window(step) or after.sh_degree(step) < before.sh_degree(step):
         expected = f"{before.num_steps:,}, or so near it that step {step:,} stays in its phase"
         raise InvalidInput("config.steps", expected, f"{after.num_steps:,}")
 

@@ -46,6 +46,11 @@ class System(Protocol):
         """All current trainable parameters, with learning rates."""
         ...
 
+    def milestones(self, num_steps: int) -> list[int]:
+        """Steps, counted from 0, at which something happens once in a run of so many, besides the beginning of motion:
+        a run that is resumed with other `--steps` may not miss or repeat it."""
+        ...
+
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
         """Called before an optimizer step. `steps` of the schedule, counted from 0, have been reached since the last
         one: one, or if the schedule follows the clock, several or none."""

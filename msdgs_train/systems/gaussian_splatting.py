@@ -103,6 +103,9 @@ class GaussianSplatting:
         own = [ParamGroup(name, [g.get_parameter(name)], lr) for name, lr in rates.items()]
         return own + self.model.motion_groups() + ([self.poses.parameter_group()] if self.poses else [])
 
+    def milestones(self, num_steps: int) -> list[int]:
+        return []
+
     @torch.no_grad()
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
         schedule, surgery = self.schedule, RowSurgery(self.model.gaussians, optimizer)

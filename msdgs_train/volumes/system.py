@@ -64,10 +64,13 @@ class VolumeSystem:
     def parameter_groups(self) -> list[ParamGroup]:
         return self.model.parameter_groups(self._step / self.schedule.num_steps)
 
+    def milestones(self, num_steps: int) -> list[int]:
+        return [round(at * num_steps) for at, _ in self.model.changes()]
+
     def before_step(self, optimizer: torch.optim.Optimizer, steps: range) -> None:
         before, self._step = list(self.model.parameters()), steps.stop - 1
-        for at, change in self.model.changes():
-            if round(at * self.schedule.num_steps) in steps:
+        for at, (_, change) in zip(self.milestones(self.schedule.num_steps), self.model.changes(), strict=True):
+            if at in steps:
                 change()
         if any(now is not then for now, then in zip(self.model.parameters(), before, strict=True)):
             restart(optimizer, self.parameter_groups())

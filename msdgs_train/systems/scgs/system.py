@@ -54,13 +54,8 @@ class SCGS(GaussianSplatting):
         if config.density.density_strategy != "gradient":
             raise InvalidInput("config.density_strategy", "gradient with sc-gs", config.density.density_strategy)
         super().__init__(schedule, scene)
-        own = self.settings
-        self.step, self.first_steps = 0, max(round(own.node_stage_fraction * schedule.num_steps), 1)
-        second = max(schedule.num_steps - self.first_steps, 1)
-        self.stages = (
-            Schedule.from_config(_first_stage(self.config, own, self.first_steps)),
-            Schedule.from_config(self.config.updated(steps=second)),
-        )
+        self.step, self.stages = 0, self._stages(schedule.num_steps)
+        self.first_steps = self.stages[0].num_steps
         for layer in self.model.deformation:
             if isinstance(layer, MLPLayer):
                 initialize_network(layer, config.run.seed)
@@ -81,6 +76,22 @@ class SCGS(GaussianSplatting):
     def is_second(self) -> bool:
         """Whether the second stage has begun."""
         return self.support.has_nodes
+
+    def _stages(self, num_steps: int) -> tuple[Schedule, Schedule]:
+        """Those of a run of so many steps."""
+        first = max(round(self.settings.node_stage_fraction * num_steps), 1)
+        return (
+            Schedule.from_config(_first_stage(self.config, self.settings, first)),
+            Schedule.from_config(self.config.updated(steps=max(num_steps - first, 1))),
+        )
+
+    def milestones(self, num_steps: int) -> list[int]:
+        """The choice of nodes, the second stage, and in it new nodes and bands of color."""
+        first, second = self._stages(num_steps)
+        bands = [band * second.sh_degree_interval for band in range(self.config.model.sh_degree + 1)]
+        densified = round(self.settings.densify_nodes_fraction * second.num_steps)
+        in_second = [first.num_steps + step for step in (*bands, densified)]
+        return [round(self.settings.node_choice_fraction * first.num_steps), *in_second]
 
     def _local(self, step: int) -> int:
         """A step of the run, counted from the start of the stage."""

@@ -1,5 +1,6 @@
 """The order of images: passes and the time window."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,27 @@ def test_trained_bands_of_color_stay_in_use() -> None:
     static = small_config(steps=3000, sh_degree_fraction=0.3, model=ModelConfig(layers=(), embedding_dim=0))
     before, near, far = (Schedule.from_config(static.updated(steps=steps)) for steps in (3000, 3300, 9000))
     assert [schedule.sh_degree(3000) for schedule in (before, near, far)] == [3, 3, 1]
-    require_same_phase(before, near, 3000)
+    require_same_phase(before, near, range(3000, 3001), lambda steps: [])
     with pytest.raises(InvalidInput, match=r"config\.steps"):
-        require_same_phase(before, far, 3000)
+        require_same_phase(before, far, range(3000, 3001), lambda steps: [])
+
+
+@pytest.mark.parametrize("milestone", [True, False], ids=["of the system", "motion"])
+@pytest.mark.parametrize(
+    ("reached", "other", "is_same"),
+    [
+        (range(9, 10), 110, True), (range(9, 10), 90, False), (range(10, 11), 100, True), (range(10, 11), 90, False),
+        (range(10, 11), 110, False), (range(11, 12), 110, False), (range(12, 13), 110, True), (range(8, 12), 90, True),
+        (range(8, 12), 60, False), (range(8, 12), 150, False),
+    ],
+)  # fmt: skip
+def test_what_happens_once_is_neither_missed_nor_repeated(
+    milestone: bool, reached: range, other: int, is_same: bool
+) -> None:
+    """At a tenth of 100 steps."""
+    start = 0.0 if milestone else 0.1
+    config = small_config(static_fraction=start, window_full_fraction=0.0, sh_degree_fraction=0.0)
+    before, after = (Schedule.from_config(config.updated(steps=steps)) for steps in (100, other))
+    expectation = contextlib.nullcontext() if is_same else pytest.raises(InvalidInput, match=r"config\.steps")
+    with expectation:
+        require_same_phase(before, after, reached, lambda steps: [steps // 10] if milestone else [])

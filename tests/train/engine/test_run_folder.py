@@ -7,6 +7,7 @@ import shutil
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,8 @@ import torch
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import WriteFailed
 from msdgs_train.cli import main as cli
+from msdgs_train.datasets import SceneData, load_scene
+from msdgs_train.engine import run as run_module
 from msdgs_train.engine.metrics_log import MetricsLog, draw_curve, read_metrics
 from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.run import fit
@@ -23,6 +26,7 @@ from msdgs_train.engine.run_record import (
     CONFIG,
     CURVE,
     KEPT,
+    LOCK,
     METRICS,
     MODEL,
     RECORD,
@@ -134,6 +138,22 @@ def test_any_file_of_a_run_guards_its_folder(data: Path, tmp_path: Path, name: s
     with pytest.raises(InvalidInput, match=f"`run` must be a new folder, .*, which holds {name}: "):
         fit(small_config(steps=1), data, run)
     assert {file.name: file.read_bytes() for file in run.iterdir()} == {name: b"precious"}
+
+
+def test_a_run_that_ended_while_the_dataset_was_loaded_is_not_overwritten(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run = tmp_path / "run"
+
+    def loaded(*given: Any) -> SceneData:
+        run.mkdir()
+        (run / MODEL).write_bytes(b"precious")
+        return load_scene(*given)
+
+    monkeypatch.setattr(run_module, "load_scene", loaded)
+    with pytest.raises(InvalidInput, match=r"`run` must be a new folder, .*, which holds model\.pt"):
+        fit(small_config(steps=1), data, run)
+    assert {file.name: file.read_bytes() for file in run.iterdir()} == {LOCK: b"", MODEL: b"precious"}
 
 
 def test_other_files_do_not(tmp_path: Path):

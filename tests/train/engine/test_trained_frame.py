@@ -9,11 +9,12 @@ import pytest
 
 from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.engine.run import RunResult, fit
-from msdgs_train.engine.run_record import RECORD, read_record
+from msdgs_train.engine.run_record import CONFIG, KEPT, RECORD, read_record
 from msdgs_train.evaluation.evaluate import evaluate_run
 from msdgs_train.gaussians.model_file import load_model
+from tests.support.splat_files import ply_bytes
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import small_config
+from tests.support.training_scene import assert_same_bits, small_config, state_of
 
 pytestmark = pytest.mark.slow
 
@@ -62,6 +63,26 @@ def test_a_run_of_the_files_own_frame_is_continued_in_it(data: Path, tmp_path: P
     (run / RECORD).write_text(json.dumps(record))
     fit(small_config(steps=6), files, run, resume=True)
     assert load_model(run / "model.pt").scene.placement == IDENTITY
+
+
+@pytest.mark.usefixtures("no_curve")
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.0, 0.0, 1e4)], ids=["seen", "unseen"])
+def test_a_run_that_starts_again_starts_with_the_same_points(
+    data: Path, tmp_path: Path, offset: tuple[float, float, float]
+):
+    """Points that no camera sees are left out there, too."""
+    files, run = placed(data, tmp_path / "data", PLACES["far"]), tmp_path / "run"
+    points = PLACES["far"].to_world(np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))) + offset
+    (files / "points.ply").write_bytes(ply_bytes(dict(zip("xyz", points.T, strict=True))))
+    contents = json.loads((files / "transforms_train.json").read_text())
+    (files / "transforms_train.json").write_text(json.dumps({**contents, "ply_file_path": "points.ply"}))
+    result = fit(small_config(steps=3), files, run)
+    first = state_of(run)
+    for name in KEPT:
+        if name not in (CONFIG, RECORD) and (run / name).is_file():
+            (run / name).unlink()
+    assert fit(small_config(steps=3), files, run, resume=True).gaussians == result.gaussians
+    assert_same_bits(first, state_of(run))
 
 
 def test_the_half_size_is_given_in_units_of_the_files(data: Path, tmp_path: Path):

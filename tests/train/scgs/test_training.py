@@ -11,6 +11,7 @@ from msdgs_serve.renderer import Renderer
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import load_scene
 from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.schedule import Schedule, require_same_phase
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.supports.scgs import SCGSConfig, SCGSSupport
@@ -101,6 +102,16 @@ def test_resuming_changes_no_bit(data: Path, tmp_path: Path, stop: int):
         for trainer_ in (trainer, resumed)
     ]  # fmt: skip
     assert_same_bits(*moments)
+
+
+@pytest.mark.parametrize(("stop", "steps"), [(9, 20), (6, 30), (CHOICE, 20), (12, 30), (18, 30)])
+def test_a_run_is_not_resumed_with_steps_that_move_it_past_a_stage(data: Path, stop: int, steps: int):
+    trainer = Trainer(small_config(), load_scene(data))
+    other, milestones = Schedule.from_config(small_config(steps=steps)), trainer.system.milestones
+    assert milestones(STEPS) == [CHOICE, STAGE, STAGE + 1, STAGE + 7]
+    require_same_phase(trainer.schedule, other, range(4, 5), milestones)
+    with pytest.raises(InvalidInput, match=r"config\.steps"):
+        require_same_phase(trainer.schedule, other, range(stop, stop + 1), milestones)
 
 
 def test_a_trained_model_is_evaluated_saved_exported_and_rendered(data: Path, tmp_path: Path):

@@ -48,6 +48,17 @@ def test_it_learns_grows_and_resumes_with_the_same_bits(name: str, data: Path, t
     assert whole.gaussians == load_stored(tmp_path / "whole" / MODEL).size > first
 
 
+def test_it_is_not_resumed_with_steps_that_miss_or_repeat_a_growth(data: Path, tmp_path: Path) -> None:
+    """It grows before steps 2, 4 and 6 of 20."""
+    run = tmp_path / "run"
+    fit(small("tineuvox-s"), data, run, observer=StopAfter(5))
+    for steps in (16, 26):
+        with pytest.raises(InvalidInput, match=r"config\.steps.*so near it that step 5 stays in its phase"):
+            fit(small("tineuvox-s", steps=steps), data, run, resume=True)
+    grown = fit(small("tineuvox-s", steps=19), data, run, resume=True).gaussians
+    assert grown == fit(small("tineuvox-s"), data, tmp_path / "whole").gaussians
+
+
 @PRESETS
 def test_its_model_file_renders_the_same(name: str, data: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
