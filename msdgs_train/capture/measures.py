@@ -29,7 +29,7 @@ class Measures:
     cuts: tuple[float, ...]
     """Seconds at which the picture changes as a whole."""
     black: float
-    """Share of the frames that are left out as black."""
+    """Share of the frames in the recordings that are left out as black."""
     repeated: int = 0
     """Frames that are left out as they show the picture before again."""
     registered: int = 0
@@ -67,16 +67,16 @@ class Measures:
 
 def measure_frames(frames: FrameSet) -> Measures:
     """The figures that frames have without poses."""
-    times = [frame.time for frame in frames.frames]
+    times, available = [frame.time for frame in frames.frames], sum(camera.available for camera in frames.cameras)
     return Measures(
         cameras=len(frames.cameras),
         frames=len(frames.frames),
-        available=sum(camera.available for camera in frames.cameras),
+        available=available,
         size=max((max(camera.width, camera.height) for camera in frames.cameras), default=1),
         seconds=max(times, default=0.0) - min(times, default=0.0),
         blurred=frames.blurred,
         cuts=frames.cuts,
-        black=frames.black / max(frames.black + len(frames.frames), 1),
+        black=frames.black / max(available, 1),
         repeated=frames.repeated,
     )
 

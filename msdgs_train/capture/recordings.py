@@ -26,7 +26,8 @@ BYTES_PER_FRAME = 4_000_000
 
 
 def digest_of(recordings: Sequence[Path]) -> str:
-    """A digest of the contents of video files and of folders of images, and of their order; not of paths.
+    """A digest of the contents of video files and of folders of images, of their order, and of the names of images,
+    which may tell times; not of other names.
 
     Raises `CaptureFailed` if two of them are the same.
     """
@@ -36,11 +37,16 @@ def digest_of(recordings: Sequence[Path]) -> str:
         if digest in known:
             raise CaptureFailed(recording, f"is the same recording as {known[digest]}: give each camera's once")
         known[digest] = recording
-    return hashlib.sha256("\n".join([__version__, *known]).encode()).hexdigest()
+    images = [file.name for recording in recordings if recording.is_dir() for file in _files(recording)]
+    return hashlib.sha256("\n".join([__version__, *known, *images]).encode()).hexdigest()
+
+
+def _files(recording: Path) -> list[Path]:
+    return sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
 
 
 def _digest(recording: Path) -> str:
-    files = sorted(file for file in recording.iterdir() if file.is_file()) if recording.is_dir() else [recording]
+    files = _files(recording)
     digest = hashlib.sha256(f"{len(files)}\n".encode())
     for file in files:
         with file.open("rb") as opened:

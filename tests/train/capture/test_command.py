@@ -121,7 +121,7 @@ def test_a_folder_of_another_recording_is_refused(
     assert "other recordings" in capsys.readouterr().err
 
 
-def test_digests_follow_contents_and_order_and_not_names(tmp_path: Path):
+def test_digests_follow_contents_order_and_names_of_images_and_not_those_of_recordings(tmp_path: Path):
     one, other = tmp_path / "a.mp4", tmp_path / "b.mp4"
     one.write_bytes(b"one")
     other.write_bytes(b"other")
@@ -134,7 +134,14 @@ def test_digests_follow_contents_and_order_and_not_names(tmp_path: Path):
     folder.mkdir()
     for file in (one, other):
         shutil.copy(file, folder)
-    assert digest_of([folder]) != digest_of([one, other])
+    before = digest_of([folder])
+    assert before != digest_of([one, other])
+    assert digest_of([folder.rename(tmp_path / "renamed")]) == before
+    folder = tmp_path / "renamed"
+    (folder / "b.mp4").rename(folder / "c.mp4")
+    assert digest_of([folder]) != before
+    with pytest.raises(CaptureFailed, match=r"images: is the same recording as .*renamed"):
+        digest_of([folder, shutil.copytree(folder, tmp_path / "images")])
     with pytest.raises(CaptureFailed, match=r"c\.mp4: is the same recording as .*a\.mp4"):
         digest_of([one, other, moved])
     claim(tmp_path / "data", digest_of([one]))

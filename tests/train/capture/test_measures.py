@@ -15,9 +15,9 @@ from tests.train.capture.made_capture import made_frames, made_model, made_poses
 
 
 def test_frames_are_counted():
-    measures = measure_frames(made_frames(30, blurred=4, black=10, repeated=7, cuts=(1.2,)))
+    measures = measure_frames(made_frames(30, blurred=4, black=9, repeated=7, cuts=(1.2,)))
     assert (measures.frames, measures.available, measures.blurred, measures.repeated) == (30, 90, 4, 7)
-    assert (measures.black, measures.cuts, measures.seconds) == (0.25, (1.2,), 2.9)
+    assert (measures.black, measures.cuts, measures.seconds) == (0.1, (1.2,), 2.9)
 
 
 def test_an_arc_is_measured():
