@@ -28,10 +28,11 @@ class Compare:
     first system (comparison.md), all numbers (comparison.json), error against training time (time.png) and against the
     number of layers (layers.png).
 
-    A system is a preset, or a table of a TOML file: a `preset` and settings of `fit` that replace its own. A scene is a
-    dataset folder, or a table of a TOML file: a `folder` relative to the file, and if needed `size`, `llffhold`,
-    `time_from` and the `splits` that are reported. Each finished run adds a row to a CSV file, and runs that have a row
-    aren't trained again, so that the same command continues after Ctrl-C.
+    A system is a preset, or a table of a TOML file: a `preset` and settings of `fit` that replace its own, but none
+    that this command sets for all systems. A scene is a dataset folder, or a table of a TOML file: a `folder` relative
+    to the file, and if needed `size`, `llffhold`, `time_from` and the `splits` that are reported. Each finished run
+    adds a row to a CSV file, and runs that have a row aren't trained again, so that the same command continues after
+    Ctrl-C.
 
     Example:  msdgs-train compare deformgs 4dgs mine.toml --data data/a data/b --out runs/all --steps 3000 --size 200
     --init-num-pts 5000 --max-gaussians 10000

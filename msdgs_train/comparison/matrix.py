@@ -19,6 +19,11 @@ from msdgs_train.systems.registry import DEFAULT, preset, systems
 EVALUATIONS = 10  # number of evaluations of held-out images during training
 LOG_LINES = 100
 DEFAULT_STEPS = 3000
+COMMAND = {
+    "minutes": "--minutes", "threads": "--threads", "time": "--time", "device": "--device", "seed": "--seeds",
+    **dict.fromkeys(("eval_every", "checkpoint_every", "log_every"), "fractions of a run"),
+}  # fmt: skip
+"""Settings that are not a system's own, and what sets them for all."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +140,12 @@ def read_system(name: str, table: Mapping[str, Any], budget: Budget) -> TrainCon
     """
     changes = {key: value for key, value in table.items() if key != "preset"}
     try:
-        return budget.of(preset(table.get("preset", DEFAULT)).updated(**changes))
+        own = preset(table.get("preset", DEFAULT)).updated(**changes)
+        shared = budget.of(own)
+        is_replaced = shared.run.steps != own.run.steps
+        for key, option in {**COMMAND, **({"steps": "--steps"} if is_replaced else {})}.items():
+            if key in changes:
+                raise InvalidInput(f"config.{key}", f"not given: {option} of the command sets it", changes[key])
+        return shared
     except (InvalidInput, TypeError, ValueError) as error:
         raise InvalidInput("config", "made of valid settings", f"system `{name}`: {error}") from error

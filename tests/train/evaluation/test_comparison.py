@@ -110,6 +110,10 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
         ("[a]\neps2d_init = '0.3'", r"system `a`.*eps2d_init"),
         ("[a.model]\nsh_dgree = 1", r"system `a`.*sh_dgree"),
         ("[a]\nsh_degree_fraction = 'long'", r"system `a`.*sh_degree_fraction"),
+        ("[a]\nsteps = 8000", r"system `a`: `config\.steps` must be not given: --steps of the command .*8000"),
+        ("[a]\nseed = 1", r"system `a`.*--seeds"),
+        ("[a]\nthreads = 1", r"system `a`.*--threads"),
+        ("[a]\neval_every = 5", r"system `a`.*eval_every"),
         ("a = 3", r"`a`"),
         ("['../up']\nsteps = 3", r"up"),
         ("[a", r"TOML"),
@@ -119,6 +123,11 @@ def test_what_cannot_be_used_is_named(tmp_path: Path, contents: str, message: st
     (tmp_path / "systems.toml").write_text(contents)
     with pytest.raises(InvalidInput, match=message):
         read_systems([str(tmp_path / "systems.toml")], BUDGET)
+
+
+def test_with_minutes_a_system_has_its_own_steps(tmp_path: Path) -> None:
+    (tmp_path / "systems.toml").write_text("[a]\nsteps = 8000")
+    assert read_systems([str(tmp_path / "systems.toml")], Budget(minutes=5))["a"].run.steps == 8000
 
 
 def test_neither_a_preset_nor_a_file(tmp_path: Path) -> None:
