@@ -23,6 +23,12 @@ def optional(metavar: str, aliases: list[str] | None = None) -> Any:
     return tyro.conf.arg(metavar=metavar, aliases=aliases, help_behavior_hint=shown)
 
 
+def require_seed(field: str, seed: object) -> None:
+    """Raise `InvalidInput` unless `seed` is a whole number in [0, 2³¹), which torch, numpy and COLMAP take."""
+    if type(seed) is not int or not 0 <= seed < 2**31:
+        raise InvalidInput(field, "0 or more, below 2³¹", seed)
+
+
 class Checked:
     """A frozen dataclass whose fields are checked when it is built."""
 

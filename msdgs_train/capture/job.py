@@ -19,6 +19,7 @@ from msdgs_train.capture.report import Report, write_report
 from msdgs_train.capture.sparse_model import FORMAT
 from msdgs_train.capture.steps import Steps, Watch
 from msdgs_train.capture.verdict import Verdict, judge, judge_frames
+from msdgs_train.settings import require_seed
 
 STEPS: dict[str, tuple[str, ...]] = {
     "frames": (),
@@ -46,8 +47,7 @@ class CaptureOptions:
 
     def __post_init__(self) -> None:
         check_amounts(self.frames, self.size)
-        if not 0 <= self.seed < 2**31:
-            raise InvalidInput("seed", "0 or more, below 2³¹", self.seed)
+        require_seed("seed", self.seed)
 
 
 class Outcome(NamedTuple):

@@ -16,7 +16,7 @@ from msdgs_train.layers.plugins import load_plugins
 from msdgs_train.layers.precision import Precision
 from msdgs_train.losses.config import LossConfig
 from msdgs_train.poses.config import PoseConfig
-from msdgs_train.settings import OWN_SETTINGS, Checked, SystemConfig, optional
+from msdgs_train.settings import OWN_SETTINGS, Checked, SystemConfig, optional, require_seed
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class RunConfig(Checked):
 
     def __post_init__(self) -> None:
         self.require_counts("steps", "batch_size", "threads")
-        self.require_counts("seed", least=0)
+        require_seed("config.seed", self.seed)
         self.require_positive_or_none("minutes")
         self.require(("time",), "wall or cpu", lambda v: v in ("wall", "cpu"))
         self.require(("device",), "cpu or cuda", lambda v: v in ("cpu", "cuda"))

@@ -112,10 +112,11 @@ class GaussianSplatting:
         if self.poses:
             self.poses.center()
         if schedule.deform_start_step in steps:
-            self.model.support.on_deform_start(self.model.gaussians, surgery)
-            points = self.model.support.points(self.model.gaussians.means)
-            for layer in self.model.deformation:
-                layer.on_deform_start(points)
+            if len(self.model.deformation):
+                self.model.support.on_deform_start(self.model.gaussians, surgery)
+                points = self.model.support.points(self.model.gaussians.means)
+                for layer in self.model.deformation:
+                    layer.on_deform_start(points)
             if schedule.restart_step:
                 restart(optimizer, self.parameter_groups())
         before, after = schedule.window(steps.start - 1), schedule.window(steps.stop - 1)

@@ -20,6 +20,7 @@ from msdgs_serve.writing import temporary_folder
 from msdgs_train.datasets.common.images import composite, resize_area, write_png
 from msdgs_train.datasets.synthetic.rendering import render
 from msdgs_train.datasets.synthetic.trajectories import trajectories
+from msdgs_train.settings import require_seed
 
 CAMERA_ANGLE_X = 0.69  # radians
 CAMERA_DISTANCE = 4.0
@@ -70,6 +71,7 @@ def generate(
             raise InvalidInput(name, f"{least} or more", value)
     if not 1 <= size <= MAX_SIZE:
         raise InvalidInput("size", f"in [1, {MAX_SIZE}] pixels", size)
+    require_seed("seed", seed)
     train = rig_views(train_frames, cameras, size, seed) if cameras else training_views(train_frames, size, seed)
     splits = {"train": train, "test": held_out_views(test_frames, size, seed)}
     total, done = len(train) + test_frames, 0

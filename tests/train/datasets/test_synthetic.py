@@ -292,7 +292,9 @@ def test_an_empty_folder_is_filled_but_foreign_folders_and_files_are_not_replace
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years of work"
 
 
-@pytest.mark.parametrize("numbers", [{"size": 0}, {"size": 5000}, {"train_frames": 0}, {"test_frames": -1}])
+@pytest.mark.parametrize(
+    "numbers", [{"size": 0}, {"size": 5000}, {"train_frames": 0}, {"test_frames": -1}, {"seed": -1}, {"seed": 2**31}]
+)
 def test_invalid_numbers_are_refused(tmp_path: Path, numbers: dict[str, Any]):
     with pytest.raises(InvalidInput) as caught:
         generate(tmp_path / "a", **numbers)

@@ -18,12 +18,19 @@ from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.gaussians.model import DynamicGaussians
+from msdgs_train.gaussians.model_file import load_model
 from msdgs_train.gaussians.modulation import EMBEDDINGS
 from msdgs_train.settings import SystemConfig
+from msdgs_train.supports.base import SupportConfig
+from msdgs_train.supports.gaussians import GaussiansConfig
+from msdgs_train.supports.nodes import NodesConfig
+from msdgs_train.supports.scgs import SCGSConfig
 from msdgs_train.systems import registry
 from msdgs_train.systems.registry import DEFAULT, preset, register_system, systems
+from tests.support.models import export_scene
 from tests.support.processes import ROOT
-from tests.support.training_scene import GAUSSIANS, shrunk, small_config, splatting
+from tests.support.tolerances import tolerance
+from tests.support.training_scene import GAUSSIANS, shrunk, small_config, splatting, trained
 
 pytestmark = pytest.mark.slow
 
@@ -134,10 +141,21 @@ def test_each_preset_trains(name: str, data: Path) -> None:
     assert trainer.step_count == step + 2
 
 
+@pytest.mark.parametrize("support", [GaussiansConfig(), NodesConfig(num_nodes=5), SCGSConfig(num_nodes=5)])
+def test_without_layers_any_support_trains_a_static_scene(support: SupportConfig, data: Path, tmp_path: Path) -> None:
+    config = small_config(steps=9, model=ModelConfig(sh_degree=1, support=support, layers=()), ema_fraction=0.1)
+    trainer = trained(config, load_scene(data), 9)
+    trainer.system.save(tmp_path / "model.pt", 9)
+    (first, *_) = trainer.evaluate("test")
+    assert torch.equal(load_model(tmp_path / "model.pt").render(first.frame.camera, 0.9).clamp(0, 1), first.rgb)
+    exported = export_scene(tmp_path / "model.pt", tmp_path / "scene.onnx", times=2)
+    assert max(exported.measured_error.values()) <= tolerance("export.relative")
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("steps", 0),
+        ("steps", 0), ("seed", -1), ("seed", 2**31),
         ("init_gray", 1.5), ("time_noise", -1.0), ("time_noise_fraction", 2.0),
         ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
         ("adam_beta2", 1.0), ("adam_eps", 0.0), ("gradient_clip", 0.0), ("means_lr_until_fraction", 0.0),
