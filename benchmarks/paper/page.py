@@ -224,8 +224,8 @@ def _runs(results: Results) -> Section:
             minutes = f"{statistics.fmean(seconds) / 60:.1f}"
             layers = _layers(row.configs[scene])
             lines.append([method.name, row.system, layers, scene, str(len(seconds)), *counts, minutes, fit])
-    columns = ["", "system", "layers", "scene", "seeds", "parameters", "of modulation", "Gaussians", "steps", "minutes"]
-    return Section("Runs", [*columns, "PSNR in training, dB"], lines)
+    columns = ["", "system", "layers", "scene", "seeds", "parameters", "of modulation", "Gaussians or vertices"]
+    return Section("Runs", [*columns, "steps", "minutes", "PSNR in training, dB"], lines)
 
 
 def _settings(results: Results) -> Section:

@@ -27,8 +27,8 @@ from msdgs_train.layers.parts import to_text
 
 TABLE, NUMBERS, TIME_PLOT, LAYERS_PLOT = "comparison.md", "comparison.json", "time.png", "layers.png"
 HEADINGS = (
-    "system", "scene", "seeds", "PSNR, dB", "SSIM", "deformation parameters", "with modulation", "Gaussians",
-    "training, s", "frame, ms",
+    "system", "scene", "seeds", "PSNR, dB", "SSIM", "deformation parameters", "with modulation",
+    "Gaussians or vertices", "training, s", "frame, ms",
 )  # fmt: skip
 BESIDE = 0.04  # horizontal offset between bars of the same K, in layers
 SAME, ROOM = 1.001, 1.1  # ratios of errors

@@ -107,7 +107,7 @@ def best_evaluations(lines: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def draw_curve(run: Path) -> None:
-    """Plot loss, PSNR on training and held-out images, and the number of Gaussians against steps, into `curve.png`."""
+    """Plot loss, PSNR on training and held-out images, and the size of the model against steps, into `curve.png`."""
     lines = read_metrics(run)
     train = [line for line in lines if line["kind"] == "train"]
     figure = Figure(figsize=(9, 9))
@@ -121,7 +121,7 @@ def draw_curve(run: Path) -> None:
         psnr.plot(*zip(*points, strict=True), marker="o", label=f"{split}, last {points[-1][1]:.2f} dB")
     psnr.legend()
     count.plot(steps, [line["gaussians"] for line in train])
-    for axis, label in ((loss, "loss"), (psnr, "PSNR, dB"), (count, "Gaussians")):
+    for axis, label in ((loss, "loss"), (psnr, "PSNR, dB"), (count, "Gaussians or vertices")):
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     count.set_xlabel("step")

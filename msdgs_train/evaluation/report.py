@@ -65,7 +65,10 @@ def as_markdown(evaluation: Evaluation) -> str:
         for m in evaluation.models
     ]
     parts = [f"# Split `{evaluation.split}`, {len(evaluation.frames)} images of {evaluation.data}"]
-    parts += [markdown_table(["model", "file", "step", "Gaussians", *HEADINGS.values()], rows), *notes(evaluation)]
+    parts += [
+        markdown_table(["model", "file", "step", "Gaussians or vertices", *HEADINGS.values()], rows),
+        *notes(evaluation),
+    ]
     for evaluated in evaluation.models:
         images = [
             [frame.name, f"{frame.t:.4g}", *cells(evaluation, scores), f"{100 * mask.mean():.1f} %"]

@@ -1,6 +1,5 @@
 """Training of a volume on batches of rays; implements `RaySystem`."""
 
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,9 @@ from torch import Tensor
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import Frame, SceneData
+from msdgs_train.datasets.config import DataConfig
 from msdgs_train.datasets.rays import Rays
-from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.config import LoggingConfig, RunConfig, TrainConfig, differences
 from msdgs_train.engine.optimizer import restart
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.gaussians.config import ModelConfig
@@ -32,8 +32,10 @@ BASE = TrainConfig().updated(
     adam_eps=1e-8,
 )
 """Settings that all volumes share: all images take part from the start."""
-UNUSED = ("curriculum", "loss", "poses", "model")
-"""Groups of settings of Gaussians; those of density control are ignored, since comparisons set them for all systems."""
+USED = frozenset({*RunConfig().names(), *DataConfig().names(), *LoggingConfig().names(), "adam_beta2", "adam_eps"})
+USED -= {"gpu_precision", "scene_half_size"}
+IGNORED = frozenset({"init_num_pts", "max_gaussians"})
+"""Numbers of Gaussians, which comparisons set for all systems."""
 
 
 class VolumeSystem:
@@ -104,9 +106,7 @@ class VolumeSystem:
 
 
 def _refuse_unused(config: TrainConfig) -> None:
-    for group in UNUSED:
-        wanted, base = getattr(config, group), getattr(BASE, group)
-        for item in fields(base):
-            if getattr(wanted, item.name) != getattr(base, item.name):
-                problem = f"not given: {config.run.system} has no Gaussians"
-                raise InvalidInput(f"config.{item.name}", problem, getattr(wanted, item.name))
+    for name, _, wanted in differences(BASE, config):
+        if name not in USED | IGNORED:
+            problem = f"not given: {config.run.system} has no Gaussians"
+            raise InvalidInput(f"config.{name}", f"{problem}, and doesn't use it", wanted)

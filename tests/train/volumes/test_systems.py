@@ -145,7 +145,10 @@ def test_runs_of_given_minutes_grow_too(data: Path, tmp_path: Path) -> None:
 
 
 def test_settings_of_gaussians_are_refused(data: Path) -> None:
-    for setting, value in (("sh_degree", 1), ("ssim_lambda", 0.5), ("static_fraction", 0.1), ("pose_opt", True)):
+    for setting, value in (
+        ("sh_degree", 1), ("ssim_lambda", 0.5), ("static_fraction", 0.1), ("pose_opt", True), ("scene_half_size", 3.0),
+        ("ema_fraction", 0.1), ("means_lr_init", 1e-3), ("gradient_clip", None), ("grow_grad2d", 1e-3),
+    ):  # fmt: skip
         with pytest.raises(InvalidInput, match=rf"`config\.{setting}` must be not given: tineuvox-s has no Gaussians"):
             Trainer(small("tineuvox-s", **{setting: value}), load_scene(data))
     Trainer(small("tineuvox-s", init_num_pts=100, max_gaussians=200), load_scene(data))
