@@ -195,7 +195,7 @@ class SceneData:
         frames = self.splits["train"] if self.unsplit is None else self.unsplit
         splits = _held_out(frames, every, {0: "test", every // 2: "val"})
         if not splits["train"]:
-            raise InvalidInput("llffhold", f"fewer than the {len(frames)} training images", every)
+            raise InvalidInput("llffhold", f"0 with so few images ({len(frames)})", every)
         return replace(self, splits=splits)
 
     def _with_each(self, change: Callable[[Frame], Frame]) -> "SceneData":

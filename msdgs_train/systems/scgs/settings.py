@@ -47,7 +47,8 @@ class SCGSSettings(SystemConfig):
         self.require_weights("elastic_weight", "acceleration_weight", "node_rigidity_weight")
         self.require_positive("rigidity_weight_init", "rigidity_weight_final", "node_stage_fraction")
         self.require_positive("node_choice_fraction", "network_until_fraction")
-        self.require_positive_or_none("gaussians_per_node")
+        if self.gaussians_per_node is not None:
+            self.require_counts("gaussians_per_node")
         self.require(("node_stage_fraction",), "above 0 and below 1", lambda value: value < 1)
 
     def rigidity_weight(self, part: float) -> float:

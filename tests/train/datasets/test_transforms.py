@@ -59,7 +59,7 @@ def test_every_nth_training_image_is_held_out(tmp_path: Path):
     assert held_out == {"test": [0.0, 0.4, 0.8], "val": [0.2, 0.6], "train": [0.1, 0.3, 0.5, 0.7, 0.9]}
     assert {frame.image_path.parent.name for frames in splits.values() for frame in frames} == {"train"}
     single = write_dnerf(folder, splits={"train": dnerf_json("train", (0.5,)), "test": dnerf_json("test", (0.5,))})
-    with pytest.raises(InvalidInput, match="`llffhold` must be fewer than the 1 training images, got 4"):
+    with pytest.raises(InvalidInput, match=r"`llffhold` must be 0 with so few images \(1\), got 4"):
         load_scene(single, llffhold=4)
 
 
