@@ -56,8 +56,8 @@ class DensityConfig(Checked):
     """mcmc: factor of the noise added to means, whose size follows from their learning rate and covariance."""
     opacity_reg: Annotated[float | None, optional("FLOAT")] = None
     """Weight of the mean opacity, which makes Gaussians that aren't needed transparent, so that they are removed; with
-    gradient until density control ends, but with one image per time not while the time window grows, when it may take
-    fast objects. 0.01 with mcmc and 0 with gradient if not given."""
+    gradient until density control ends, but with one image per time not in the time window, static or growing, when it
+    may take fast objects. 0.01 with mcmc and 0 with gradient if not given."""
     scale_reg: Annotated[float | None, optional("FLOAT")] = None
     """Weight of the mean scale in scene units, as --opacity-reg."""
 

@@ -20,7 +20,7 @@ class ParameterCounts(NamedTuple):
     """Trainable numbers of a model beside canonical Gaussians."""
 
     motion: int  # of the deformation; of a volume all
-    modulation: int  # of sizes and opacities by time, embeddings included
+    modulation: int  # of the modulation, embeddings included
 
 
 class StoredModel(Protocol):

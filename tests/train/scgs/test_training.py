@@ -45,9 +45,10 @@ def system_of(trainer: Trainer) -> SCGS:
 def test_the_preset_has_the_published_number_of_parameters():
     model = preset("sc-gs").model
     network = model.layers[0].build(None, model.heads, model.support.num_nodes)  # pyright: ignore
-    numbers = sum(p.numel() for part in (network, model.support.build()) for p in part.parameters())
+    parameters = [p for part in (network, model.support.build()) for p in part.parameters()]
+    published, fixed = (sum(p.numel() for p in parameters if p.requires_grad in which) for which in ((0, 1), (0,)))
     per_gaussian = sum(attribute.columns for attribute in model.attributes().values())
-    assert (numbers, per_gaussian) == (529_964, 8)
+    assert (published, fixed, per_gaussian) == (529_964, 3 * 512, 8)
 
 
 def test_nodes_are_chosen_among_gaussians_of_one_size_which_new_ones_follow(data: Path):
