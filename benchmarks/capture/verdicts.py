@@ -3,8 +3,8 @@
 
     python -m benchmarks.capture.verdicts [--only TEXT] [--out verdicts.csv]
 
-Cameras move on arcs of 1° to 80°, turn on the spot, or stand still, with and without a large moving poster; then
-few frames, and motion blur. Each row has the figures of a capture, the largest rotation error in degrees, the centers'
+Cameras move on arcs of 2° to 40°, turn on the spot, or stand still, some beside a large moving poster; then few frames.
+Each row has the figures of a capture, the largest rotation error in degrees, the centers'
 errors in percent of their extent after alignment, and the verdict.
 """
 

@@ -1,1 +1,1 @@
-"""Imports and exports: `imported_formats`, `nodes`, `paper_sized`, `scene_file`."""
+"""Imports and exports: `imported_formats`, `large_import`, `nodes`, `paper_sized`, `scene_file`."""

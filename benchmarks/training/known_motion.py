@@ -24,6 +24,8 @@ from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.base import SceneBounds
+from msdgs_train.supports.gaussians import GaussiansConfig
+from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems.registry import DEFAULT
 
 MOVING = OBJECTS[2:]
@@ -56,6 +58,10 @@ def main(
         return self_test()
     try:
         known = read_systems(systems, Budget(steps))
+        for name, config in known.items():
+            if not isinstance(config.model.support, GaussiansConfig | NodesConfig):
+                expected = "systems whose nodes, if they have any, are placed when motion begins"
+                raise InvalidInput("systems", expected, f"{name}, on the support {config.model.support.kind}")
     except InvalidInput as error:
         report_console().print(f"error: {error}", style="red", markup=False)
         return 1
@@ -78,6 +84,9 @@ def errors_of(config: TrainConfig, seed: int, points: int) -> np.ndarray:
     schedule, groups = Schedule.from_config(config), model.motion_groups()
     optimizer = make_optimizer(groups, schedule)
     model.support.on_deform_start(model.gaussians, RowSurgery(model.gaussians, optimizer))
+    moved = model.support.points(model.gaussians.means)
+    for layer in model.deformation:
+        layer.on_deform_start(moved)
     random = np.random.default_rng(seed)
     for step in range(schedule.num_steps):
         set_learning_rates(optimizer, groups, schedule, step, factor=1.0)
