@@ -36,11 +36,6 @@ class Offsets(NamedTuple):
     note: str
     """How they were found, a sentence."""
 
-    @property
-    def are_heard(self) -> bool:
-        """Whether they are known by sound; otherwise all videos are taken to start together."""
-        return min(self.confidence) >= MIN_CONFIDENCE
-
 
 class Sound(NamedTuple):
     """The sound of a video."""

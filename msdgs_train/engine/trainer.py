@@ -207,11 +207,6 @@ class Trainer:
             generator.set_state(stored)
 
     @property
-    def skipped(self) -> int:
-        """Steps of the whole run whose loss or gradient was not finite."""
-        return self._meter.skipped
-
-    @property
     def is_skipping(self) -> bool:
         """Whether the last step was skipped."""
         self._meter.read()

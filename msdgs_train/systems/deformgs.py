@@ -5,6 +5,9 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.systems.registry import register_system
 
+NO_CAP = 10**9
+"""Gaussians at most, in loops without an upper bound."""
+
 PUBLISHED = TrainConfig().updated(
     steps=40_000,
     background="black",

@@ -12,12 +12,11 @@ from msdgs_train.engine.config import TrainConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.layers.plane import PlaneConfig
-from msdgs_train.systems.deformgs import PUBLISHED
+from msdgs_train.systems.deformgs import NO_CAP, PUBLISHED
 from msdgs_train.systems.fourdgs import FOURDGS
 from msdgs_train.systems.msdgs import PAPER_LAYERS
 from msdgs_train.systems.registry import register_system
 
-NO_CAP = 10**9
 PLANE_POINTS = 50_000
 """Table 4's modulation has 1.69 M parameters with planes and 3.41 M with MLPs, 52,776 and 106,526 Gaussians; those with
 MLPs start as 100,000."""

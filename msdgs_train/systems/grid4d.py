@@ -6,8 +6,8 @@ Constants of its commit c9a93fb for D-NeRF: arguments/, train.py and scene/. Tho
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.hash4d import Hash4DConfig
-from msdgs_train.systems.deformgs import PUBLISHED
-from msdgs_train.systems.faithful import NO_CAP, published
+from msdgs_train.systems.deformgs import NO_CAP, PUBLISHED
+from msdgs_train.systems.faithful import published
 from msdgs_train.systems.registry import register_system
 
 STEPS = 50_000

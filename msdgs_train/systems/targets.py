@@ -37,11 +37,6 @@ class TrainingImage(NamedTuple):
     mask: Tensor | None  # [H, W] bool, true where pixels count; None: all do
     facts: ImageFacts
 
-    @classmethod
-    def of(cls, rgba: np.ndarray, mask: np.ndarray | None = None) -> "TrainingImage":
-        """An image on the CPU."""
-        return cls(torch.from_numpy(rgba), None if mask is None else torch.from_numpy(mask), ImageFacts.of(rgba, mask))
-
 
 class TrainingImages:
     """The images of a run. Up to `max_bytes` of them stay on its device, others are copied there whenever they are

@@ -33,6 +33,7 @@ from msdgs_train.layers.spline import SplineConfig
 from msdgs_train.supports.nodes import NodesConfig
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from msdgs_train.systems.registry import systems
+from msdgs_train.systems.targets import ImageFacts, TrainingImage
 from msdgs_train.volumes.config import VolumeConfig
 from tests.support.scenes import gaussians_of
 
@@ -133,6 +134,12 @@ def shrunk(config: TrainConfig) -> TrainConfig:
         model=model, steps=12, static_fraction=static, threads=2, init_num_pts=60, max_gaussians=90,
         refine_start_fraction=4 / 12, refine_every_fraction=4 / 12, sh_degree_fraction=4 / 12,
     )  # fmt: skip
+
+
+def training_image(rgba: np.ndarray, mask: np.ndarray | None = None) -> TrainingImage:
+    """An image, [H, W, 4] uint8, on the CPU; `mask`, [H, W] bool, is true where pixels count."""
+    counts = None if mask is None else torch.from_numpy(mask)
+    return TrainingImage(torch.from_numpy(rgba), counts, ImageFacts.of(rgba, mask))
 
 
 def splatting(trainer: Trainer) -> GaussianSplatting:

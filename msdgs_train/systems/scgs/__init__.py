@@ -7,12 +7,10 @@ from msdgs_train.engine.config import TrainConfig
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.mlp import MLPConfig
 from msdgs_train.supports.scgs import SCGSConfig
-from msdgs_train.systems.deformgs import PUBLISHED
+from msdgs_train.systems.deformgs import NO_CAP, PUBLISHED
 from msdgs_train.systems.registry import register_system
 from msdgs_train.systems.scgs.settings import SCGSSettings
 from msdgs_train.systems.scgs.system import SCGS
-
-NO_CAP = 10**9
 
 MODEL = ModelConfig(
     support=SCGSConfig(),

@@ -11,9 +11,9 @@ from msdgs_train.engine.schedule import Schedule
 from msdgs_train.rendering.rasterize import rasterize
 from msdgs_train.systems.base import Moment
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
-from msdgs_train.systems.targets import ImageFacts, Target, TrainingImage
+from msdgs_train.systems.targets import ImageFacts, Target
 from tests.support.tolerances import tolerance
-from tests.support.training_scene import small_config
+from tests.support.training_scene import small_config, training_image
 
 WEIGHT = 3.0
 MOMENT = Moment(0, torch.Generator())
@@ -24,7 +24,7 @@ def test_alpha_is_compared_with_that_of_the_image(data: Path) -> None:
     frame, white = scene.splits["train"][0], torch.ones(3)
     rgba = frame.load_rgba().copy()
     rgba[: len(rgba) // 2, :, 3] = np.arange(rgba.shape[1])
-    target = Target.over(TrainingImage.of(rgba), white)
+    target = Target.over(training_image(rgba), white)
     with_weight, without = (
         GaussianSplatting(Schedule.from_config(small_config(alpha_weight=weight)), scene) for weight in (WEIGHT, 0.0)
     )
@@ -38,10 +38,10 @@ def test_alpha_is_compared_with_that_of_the_image(data: Path) -> None:
 
 def test_a_target_is_the_image_over_the_background() -> None:
     rgba = np.array([[[255, 0, 0, 255], [255, 0, 0, 0]]], np.uint8)
-    target = Target.over(TrainingImage.of(rgba), torch.tensor([0.0, 0.0, 1.0]))
+    target = Target.over(training_image(rgba), torch.tensor([0.0, 0.0, 1.0]))
     assert target.rgb.tolist() == [[[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]
     assert float(target.alpha_error(torch.tensor([[0.5, 0.25]]))) == pytest.approx(0.375)
-    opaque = Target.over(TrainingImage.of(rgba[:, :1]), torch.zeros(3))
+    opaque = Target.over(training_image(rgba[:, :1]), torch.zeros(3))
     assert float(opaque.alpha_error(torch.zeros(1, 1))) == 0
 
 
@@ -65,7 +65,7 @@ def test_with_an_opacity_head_an_image_never_shows_everything(data: Path) -> Non
     rgba[1:-1, 1:-1, 3] = 255
     shown = [
         GaussianSplatting(Schedule.from_config(small_config(opacity_head=head)), scene)
-        .loss(frame, Target.over(TrainingImage.of(rgba), white), white, MOMENT)
+        .loss(frame, Target.over(training_image(rgba), white), white, MOMENT)
         .shows_all
         for head in (False, True)
     ]

@@ -24,9 +24,19 @@ from msdgs_train.layers import arrays
 from msdgs_train.systems.registry import preset, systems
 from msdgs_train.systems.scgs import losses
 from msdgs_train.systems.scgs.settings import SCGSSettings
-from msdgs_train.systems.targets import Target, TrainingImage, TrainingImages
+from msdgs_train.systems.targets import Target, TrainingImages
 from tests.support.tolerances import assert_close, tolerance
-from tests.support.training_scene import MODELS, SIZE, VOLUMES, StopAfter, shrunk, small_config, splatting, trained
+from tests.support.training_scene import (
+    MODELS,
+    SIZE,
+    VOLUMES,
+    StopAfter,
+    shrunk,
+    small_config,
+    splatting,
+    trained,
+    training_image,
+)
 from tests.support.without_kernels import NoReads, switch_kernels_off
 
 ALL_PARTS = {
@@ -274,7 +284,7 @@ def test_images_stay_on_the_device_while_there_is_room(free: int, data: Path) ->
 
 def test_a_target_is_the_same_without_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
     rgba = np.random.default_rng(0).integers(0, 256, (7, 9, 4), np.uint8)
-    image, background = TrainingImage.of(rgba, rgba[..., 0] > 90), torch.tensor([0.2, 0.5, 0.7])
+    image, background = training_image(rgba, rgba[..., 0] > 90), torch.tensor([0.2, 0.5, 0.7])
     wanted = Target.over(image, background)
     monkeypatch.setattr(arrays, "has_kernels", lambda tensor: False)
     got = Target.over(image, background)

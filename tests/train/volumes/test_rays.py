@@ -13,12 +13,12 @@ from msdgs_train.datasets import load_scene
 from msdgs_train.datasets import rays as rays_module
 from msdgs_train.datasets.common.images import write_png
 from msdgs_train.datasets.rays import RayBatches, Rays, rays_of
-from msdgs_train.systems.targets import Target, TrainingImage
+from msdgs_train.systems.targets import Target
 from msdgs_train.volumes.march import weigh
 from msdgs_train.volumes.samples import Samples
 from msdgs_train.volumes.space import Box, in_occupied, occupied_cells
 from tests.support.tolerances import assert_close
-from tests.support.training_scene import SIZE
+from tests.support.training_scene import SIZE, training_image
 
 BATCH = 100
 
@@ -86,7 +86,7 @@ def test_images_that_are_too_many_or_too_small_are_refused(data: Path, monkeypat
 def test_pixels_over_a_background_are_those_of_images(data: Path) -> None:
     rgba = np.random.default_rng(0).integers(0, 256, (5, 7, 4), np.uint8)
     background = torch.tensor([0.2, 0.5, 0.9])
-    image = Target.over(TrainingImage.of(rgba), background)
+    image = Target.over(training_image(rgba), background)
     pixels = Target.of_pixels(torch.from_numpy(rgba.reshape(-1, 4)), background)
     assert_close(pixels.rgb, image.rgb.reshape(-1, 3), "volume.forward")
     assert torch.equal(pixels.alpha, image.alpha.reshape(-1))
