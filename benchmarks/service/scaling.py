@@ -209,7 +209,7 @@ def check() -> int:
     extrapolate(small, Measured(one, 100.0, 0.5, 1e4), pose_bytes=400_000)
     trace = zipf_trace(small.frames, SCENES, TIMES)
     found = fastest(small, trace)
-    assert (len(found.stages.hit), len(found.stages.miss)) == (40 - distinct_poses(trace), distinct_poses(trace))
+    assert distinct_poses(trace) <= len(found.stages.miss) < small.frames  # each pose is computed, and some stay
     assert min(found.rate, found.frame_bytes, *found.stages.hit, *found.stages.miss) > 0
     report(small, trace, found)  # on a busy machine the simulated rate may differ
     return 0
