@@ -19,11 +19,12 @@ from msdgs_train.systems.registry import DEFAULT, preset, systems
 EVALUATIONS = 10  # number of evaluations of held-out images during training
 LOG_LINES = 100
 DEFAULT_STEPS = 3000
-COMMAND = {
-    "minutes": "--minutes", "threads": "--threads", "time": "--time", "device": "--device", "seed": "--seeds",
-    **dict.fromkeys(("eval_every", "checkpoint_every", "log_every"), "fractions of a run"),
-}  # fmt: skip
-"""Settings that are not a system's own, and what sets them for all."""
+SHARED = {
+    **{name: f"--{name} sets it for all systems" for name in ("minutes", "threads", "time", "device")},
+    "seed": "--seeds sets it for all systems",
+    **dict.fromkeys(("eval_every", "checkpoint_every", "log_every"), "it is a fraction of the run, for all systems"),
+}
+"""Settings that are not a system's own, and why."""
 
 
 @dataclass(frozen=True)
@@ -142,10 +143,10 @@ def read_system(name: str, table: Mapping[str, Any], budget: Budget) -> TrainCon
     try:
         own = preset(table.get("preset", DEFAULT)).updated(**changes)
         shared = budget.of(own)
-        is_replaced = shared.run.steps != own.run.steps
-        for key, option in {**COMMAND, **({"steps": "--steps"} if is_replaced else {})}.items():
+        steps = {"steps": "--steps sets it for all systems"} if shared.run.steps != own.run.steps else {}
+        for key, why in {**SHARED, **steps}.items():
             if key in changes:
-                raise InvalidInput(f"config.{key}", f"not given: {option} of the command sets it", changes[key])
+                raise InvalidInput(f"config.{key}", f"not given: {why}", changes[key])
         return shared
     except (InvalidInput, TypeError, ValueError) as error:
         raise InvalidInput("config", "made of valid settings", f"system `{name}`: {error}") from error
