@@ -23,7 +23,7 @@ from msdgs_serve.store import SceneStore
 
 DESCRIPTION = """Frames of dynamic Gaussian scenes, for any camera and any time.
 
-World and cameras have OpenCV axes: x right, y down, z forward. Angles are degrees. Every error is
+Cameras have OpenCV axes: x right, y down, z forward. Angles are degrees. Every error is
 `application/problem+json` (RFC 9457) and names the invalid fields. Every response has an `X-Request-ID`, which is the
 client's own if it sends a valid one."""
 

@@ -11,7 +11,7 @@ COLUMNS = ("chosen on", "last, dB", "best, dB", "step of the best")
 NOTE = (
     "PSNR of the last model and of the best of those evaluated during training, mean ± standard deviation over seeds, "
     "on the images by which the best is chosen: val, or test where there are none. "
-    "A dash: the row is older than these columns."
+    "A dash: not recorded."
 )
 
 
