@@ -42,7 +42,7 @@ DEFAULT_CHANNELS: tuple[Channel, ...] = ("rgb", "alpha", "depth")
 WIDTHS: dict[Channel, int] = {"rgb": 3, "alpha": 1, "depth": 1, "motion": 2, "gaussians": 1}
 DEFAULT_SECONDS = 60.0
 TRIES = 4
-OVERLOADED = 503
+OVERLOADED, DELETED = 503, 204
 
 
 class ClientError(Exception):
@@ -200,7 +200,10 @@ class Client:
 
     def render_file(self, camera: Camera, t: Time, *, format: Format = "png", **options: Any) -> bytes:
         """Return a frame as an image file; `options` are those of `request_body`."""
-        return self._call("POST", "/render", json=request_body(camera, t, format=format, **options)).content
+        response = self._call("POST", "/render", json=request_body(camera, t, format=format, **options))
+        if not response.headers.get("Content-Type", "").startswith(("image/", "application/x-npy")):
+            raise _foreign(response)
+        return response.content
 
     def render_many(self, bodies: Iterable[Mapping[str, Any]]) -> Iterator[tuple[int, bytes | Problem]]:
         """Yield index and file of many frames as they are ready; bodies are those of `request_body`.
@@ -223,7 +226,7 @@ class Client:
     def scene(self, name: str) -> dict[str, Any]:
         """Return the description of a scene: time range, cameras, plan, measured error."""
         response = self._call("GET", f"/scenes/{quote(name, safe='')}")
-        return _read(response, lambda text: dict(json.loads(text)), response.content)
+        return _read(response, _object, response.content)
 
     def add_scene(self, name: str, file: Path, *, replace: bool = False) -> str:
         """Add a scene file, if the service allows uploads, and return its SHA-256."""
@@ -233,7 +236,9 @@ class Client:
 
     def delete_scene(self, name: str) -> None:
         """Delete a scene, if the service allows uploads."""
-        self._call("DELETE", f"/scenes/{quote(name, safe='')}")
+        response = self._call("DELETE", f"/scenes/{quote(name, safe='')}")
+        if response.status_code != DELETED:
+            raise _foreign(response)
 
     def ready(self) -> bool:
         """Whether the service is ready to render frames."""
@@ -358,8 +363,19 @@ def _read(response: httpx.Response, read: Callable[[Body], Content], body: Body)
     try:
         return read(body)
     except (ValueError, LookupError, TypeError):
-        kind = response.headers.get("Content-Type", "without a type")
-        raise ClientError(f"{response.url}: not an answer of the service, but {kind}") from None
+        raise _foreign(response) from None
+
+
+def _object(text: bytes) -> dict[str, Any]:
+    value = json.loads(text)
+    if not isinstance(value, dict):
+        raise TypeError
+    return value
+
+
+def _foreign(response: httpx.Response) -> ClientError:
+    kind = response.headers.get("Content-Type", "without a type")
+    return ClientError(f"{response.url}: not an answer of the service, but {kind}")
 
 
 def _problem(response: httpx.Response) -> Problem:

@@ -108,16 +108,16 @@ def move_all(moves: Sequence[tuple[Path, Path]]) -> None:
 
 @contextmanager
 def made_folder(path: Path) -> Iterator[None]:
-    """Make a folder if there is none. It goes again if the block raises and leaves nothing in it."""
-    is_new = not path.exists()
+    """Make a folder and those above it, if there are none. They go again if the block raises and leaves them empty."""
+    new = [each for each in (path, *path.parents) if not each.exists()]
     with writing(path):
         path.mkdir(parents=True, exist_ok=True)
     try:
         yield
     except BaseException:
-        if is_new:
-            with suppress(OSError):
-                path.rmdir()
+        with suppress(OSError):
+            for each in new:
+                each.rmdir()
         raise
 
 

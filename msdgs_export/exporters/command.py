@@ -165,6 +165,8 @@ def _usd(session: DeformationSession, options: ConvertOptions, console: Console)
     moves = session.scene.moving_count and options.t is None
     if moves and metadata.is_switched:
         raise InvalidInput("t", "given: frames of this scene are switched, and USD would blend them", "nothing")
+    if not moves and options.frames is not None:
+        raise InvalidInput("frames", "left out for a scene that stands still", options.frames)
     single = metadata.time_range[0] if options.t is None else options.t
     times = _times(session, options) if moves else [single]
     check, scale = RoundTrip(session), _written_units(out, metadata)

@@ -90,7 +90,7 @@ def figures(measures: Measures) -> Iterator[tuple[str, str]]:
         yield "agrees with the poses, of what frames share", f"{min(measures.agreement, 1):.0%}"
     yield "moves, of the image", f"{measures.moving:.0%}"
     yield "intervals left out as blurred", f"{measures.blurred}"
-    yield "black frames", f"{measures.black:.0%}"
+    yield "black, of the recording", f"{measures.black:.0%}"
     yield "cuts", ", ".join(f"{cut:.1f} s" for cut in measures.cuts) or "none"
     yield "points", f"{measures.points:,}; {measures.seen:.0f} in a frame"
     yield "mapper", measures.method or "none"

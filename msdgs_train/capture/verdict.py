@@ -13,7 +13,7 @@ from msdgs_train.capture.measures import Measures
 MIN_FRAMES, FEW_FRAMES = 12, 40
 """Frames below which there is no scene, and below which it is rough."""
 MAX_BLACK = 0.5
-"""Share of the frames that are black."""
+"""Share of the frames in the recordings that are black."""
 MIN_REGISTERED, FEW_REGISTERED = 0.5, 0.95
 """Shares of frames with poses."""
 MIN_WHOLE = 0.75
@@ -93,7 +93,9 @@ def judge(measures: Measures) -> Verdict:
 def _of_frames(measures: Measures) -> Iterator[Finding]:
     if measures.black > MAX_BLACK:
         yield Finding(
-            f"{measures.black:.0%} of the frames are black", "look at the recording; is a lens covered?", prevents=True
+            f"{measures.black:.0%} of the recording is black",
+            "look at the recording; is a lens covered?",
+            prevents=True,
         )
     elif measures.frames < MIN_FRAMES:
         recorded = f"of {measures.available} in the recording"

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.scenes import SPLITS, Scene
 from msdgs_train.comparison.tables import read_tables, require_unique
-from msdgs_train.engine.config import TrainConfig
+from msdgs_train.engine.config import TrainConfig, differences
 from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.parts import to_text
 from msdgs_train.settings import optional
@@ -143,10 +143,11 @@ def read_system(name: str, table: Mapping[str, Any], budget: Budget) -> TrainCon
     try:
         own = preset(table.get("preset", DEFAULT)).updated(**changes)
         shared = budget.of(own)
-        steps = {"steps": "--steps sets it for all systems"} if shared.run.steps != own.run.steps else {}
-        for key, why in {**SHARED, **steps}.items():
-            if key in changes:
-                raise InvalidInput(f"config.{key}", f"not given: {why}", changes[key])
+        replaced = {key for key, *_ in differences(own, shared)}
+        for key, value in changes.items():
+            if key in SHARED or key in replaced:
+                why = SHARED.get(key, f"--{key.replace('_', '-')} sets it for all systems")
+                raise InvalidInput(f"config.{key}", f"not given: {why}", value)
         return shared
     except (InvalidInput, TypeError, ValueError) as error:
         raise InvalidInput("config", "made of valid settings", f"system `{name}`: {error}") from error

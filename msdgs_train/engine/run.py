@@ -132,8 +132,9 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         continues = resume and (folder / CHECKPOINT).exists()
         seconds = trainer.load_checkpoint(folder / CHECKPOINT) if continues else 0.0
         if stored:
-            before, milestones = Schedule.from_config(stored), trainer.system.milestones
-            require_same_phase(before, trainer.schedule, trainer.reached, milestones)
+            if stored.run.steps != config.run.steps:
+                before, milestones = Schedule.from_config(stored), trainer.system.milestones
+                require_same_phase(before, trainer.schedule, trainer.reached, milestones)
             if trainer.step_count >= config.run.steps and stored.run.minutes != config.run.minutes:
                 raise InvalidInput("config.minutes", "unchanged, as the run is finished", config.run.minutes)
         if lock is None:

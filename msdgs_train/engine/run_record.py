@@ -90,7 +90,9 @@ def read_config(run: Path) -> TrainConfig:
         problem = f"{reason(error)}; RUN must be the folder of a run of `msdgs-train fit DATA RUN`"
         raise RunInvalid(path, problem) from None
     except InvalidInput as error:
-        problem = f"isn't usable: {error}. If no --plugin is missing it is of another version: train in a new folder"
+        problem = (
+            f"isn't usable: {error}. Give the run's --plugin, if it had one; else it is of another version: train anew"
+        )
         raise RunInvalid(path, problem) from None
     except (ValueError, AttributeError, TypeError, RecursionError):
         problem = "is damaged: put a copy of it there, or train again in a new folder"

@@ -33,7 +33,7 @@ BASE = TrainConfig().updated(
 )
 """Settings that all volumes share: all images take part from the start."""
 USED = frozenset({*RunConfig().names(), *DataConfig().names(), *LoggingConfig().names(), "adam_beta2", "adam_eps"})
-USED -= {"gpu_precision", "scene_half_size"}
+USED -= {"gpu_image_memory", "gpu_precision", "scene_half_size"}
 IGNORED = frozenset({"init_num_pts", "max_gaussians"})
 """Numbers of Gaussians, which comparisons set for all systems."""
 
@@ -108,5 +108,4 @@ class VolumeSystem:
 def _refuse_unused(config: TrainConfig) -> None:
     for name, _, wanted in differences(BASE, config):
         if name not in USED | IGNORED:
-            problem = f"not given: {config.run.system} has no Gaussians"
-            raise InvalidInput(f"config.{name}", f"{problem}, and doesn't use it", wanted)
+            raise InvalidInput(f"config.{name}", f"not given: {config.run.system} doesn't use it", wanted)

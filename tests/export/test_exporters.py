@@ -269,7 +269,7 @@ def test_on_a_full_disk_no_frame_of_a_sequence_stays(tmp_path: Path):
 
 
 def test_frames_that_were_moved_go_back_if_others_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    scene, out, replace = scene_file(tmp_path), tmp_path / "frames", os.replace
+    scene, out, replace = scene_file(tmp_path), tmp_path / "new" / "frames", os.replace
 
     def interrupted(source: Path, target: Path) -> None:
         if target.name.endswith("_1.ply") and target.parent == out:
@@ -280,7 +280,7 @@ def test_frames_that_were_moved_go_back_if_others_cannot_be(tmp_path: Path, monk
         patch.setattr(os, "replace", interrupted)
         with pytest.raises(KeyboardInterrupt):
             run(scene, out, frames=3)
-    assert not out.exists()
+    assert os.listdir(tmp_path) == [scene.name]
 
 
 @pytest.mark.parametrize("of", ["network", "sequence"])

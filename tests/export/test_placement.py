@@ -38,7 +38,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def converted(scene: Path, out: Path) -> str:
     """Convert; return what the command prints."""
     shown = Console(file=StringIO(), width=300)
-    convert(ConvertOptions(scene, out, None, 2, None), shown)
+    convert(ConvertOptions(scene, out, frames=None if out.suffix else 2), shown)
     assert isinstance(shown.file, StringIO)
     return shown.file.getvalue()
 

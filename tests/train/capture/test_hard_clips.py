@@ -63,7 +63,7 @@ def test_black_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["capture", str(clip), str(tmp_path / "dark")]) == EXIT_INVALID
     assert "black" in capsys.readouterr().err
     clip = write_clip(tmp_path / "clip.mp4", [*pictures(12), *dark])
-    assert "of the frames are black" in refused(clip, tmp_path / "data", capsys)
+    assert "of the recording is black" in refused(clip, tmp_path / "data", capsys)
 
 
 READABLE = {

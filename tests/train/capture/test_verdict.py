@@ -41,7 +41,7 @@ NO_SCENE = {
     "pure pan without poses": ({"registered": 0, "beyond_rotation": 0.7, "parallax": 0.0}, "only turns"),
     "poses of a few points": ({"seen": 5.0}, "5 points"),
     "8 frames": ({"frames": 8, "available": 8, "registered": 8}, "8 frames, of 8"),
-    "black": ({"black": 0.8, "registered": 0}, "80% of the frames are black"),
+    "black": ({"black": 0.8, "registered": 0}, "80% of the recording is black"),
     "cut": ({"registered": 110, "breaks": (4.24,)}, "break off at 4.2 s"),
     "nothing but what moves": ({"registered": 20, "moving": 0.7}, "70% of the image moves"),
     "no texture": ({"registered": 0, "parallax": 0.0}, "0 of 200 frames"),

@@ -227,7 +227,9 @@ def test_checkpoints_of_other_programs_are_named(data: Path, run: Path, capsys: 
 
 def test_settings_that_are_damaged_or_missing_are_named(run: Path):
     (run / CONFIG).write_text('{"run": {"steps": 0}}')
-    with pytest.raises(RunInvalid, match=r"config\.json: isn't usable: `config.steps` must be .* no --plugin is"):
+    with pytest.raises(
+        RunInvalid, match=r"config\.json: isn't usable: `config.steps` must be .* Give the run's --plugin"
+    ):
         read_config(run)
     (run / CONFIG).unlink()
     with pytest.raises(InvalidInput, match=r"which has no config\.json"):

@@ -110,7 +110,7 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
         ("[a]\neps2d_init = '0.3'", r"system `a`.*eps2d_init"),
         ("[a.model]\nsh_dgree = 1", r"system `a`.*sh_dgree"),
         ("[a]\nsh_degree_fraction = 'long'", r"system `a`.*sh_degree_fraction"),
-        ("[a]\nsteps = 8000", r"system `a`: `config\.steps` must be not given: --steps of the command .*8000"),
+        ("[a]\nsteps = 8000", r"system `a`: `config\.steps` must be not given: --steps sets it .*8000"),
         ("[a]\nseed = 1", r"system `a`.*--seeds"),
         ("[a]\nthreads = 1", r"system `a`.*--threads"),
         ("[a]\neval_every = 5", r"system `a`.*eval_every"),

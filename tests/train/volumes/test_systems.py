@@ -149,7 +149,7 @@ def test_settings_of_gaussians_are_refused(data: Path) -> None:
         ("sh_degree", 1), ("ssim_lambda", 0.5), ("static_fraction", 0.1), ("pose_opt", True), ("scene_half_size", 3.0),
         ("ema_fraction", 0.1), ("means_lr_init", 1e-3), ("gradient_clip", None), ("grow_grad2d", 1e-3),
     ):  # fmt: skip
-        with pytest.raises(InvalidInput, match=rf"`config\.{setting}` must be not given: tineuvox-s has no Gaussians"):
+        with pytest.raises(InvalidInput, match=rf"`config\.{setting}` must be not given: tineuvox-s doesn't use it"):
             Trainer(small("tineuvox-s", **{setting: value}), load_scene(data))
     Trainer(small("tineuvox-s", init_num_pts=100, max_gaussians=200), load_scene(data))
 
