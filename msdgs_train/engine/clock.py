@@ -1,6 +1,7 @@
 """The clock of a run of given minutes: how far each optimizer step advances the schedule."""
 
 SMOOTHING = 0.9  # of the time of an image: a moving average over about 10 steps
+MAX_HELD_OUT_SHARE = 0.25  # of the time of a run, kept for its last evaluation: images of a volume may take minutes
 
 
 class Clock:
@@ -17,7 +18,8 @@ class Clock:
 
         Args:
             limit: seconds of the whole run, evaluations and saving included.
-            held_out: images of the last evaluation; each takes about as long as a training image.
+            held_out: images of the last evaluation; each takes about as long as a training image. If they take more
+                than `MAX_HELD_OUT_SHARE` of the time, the run takes longer than its limit.
             static_steps: the first steps, without deformation.
             deforming_cost: time of each of the others, in static steps.
         """
@@ -38,7 +40,8 @@ class Clock:
         last = step_seconds / images
         mean = last if self._image_seconds is None else self._image_seconds
         self._image_seconds = SMOOTHING * mean + (1 - SMOOTHING) * last
-        left = self._limit - self._held_out * self._image_seconds - seconds
+        kept = min(self._held_out * self._image_seconds, MAX_HELD_OUT_SHARE * self._limit)
+        left = self._limit - kept - seconds
         ends = left <= step_seconds
         if ends:
             self._position = self._num_steps

@@ -52,6 +52,15 @@ def test_faster_static_steps_have_their_share_of_the_steps(measured: float) -> N
     assert counts[0] / sum(counts) == pytest.approx(static / STEPS, rel=0.03 if measured == 5 else 0.25)
 
 
+def test_slow_held_out_images_leave_most_of_the_time_for_training() -> None:
+    """As those of volumes in their first steps: 40 images of 20 s, in a run of 300."""
+    clock, position, seconds = Clock(STEPS, LIMIT, HELD_OUT, 0), 0, 0.0
+    while position < STEPS:
+        seconds += 0.4
+        position += clock.advance(position, 0.4, 0.02, seconds)
+    assert seconds == pytest.approx(0.75 * LIMIT, rel=0.01)
+
+
 def test_it_goes_on_from_where_a_stopped_run_was() -> None:
     clock = Clock(STEPS, LIMIT, 0, STEPS // 2)
     advances = [clock.advance(STEPS // 2, 1.0, IMAGES, 151.0 + i) for i in range(3)]
