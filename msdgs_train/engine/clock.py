@@ -2,6 +2,8 @@
 
 SMOOTHING = 0.9  # of the time of an image: a moving average over about 10 steps
 MAX_HELD_OUT_SHARE = 0.25  # of the time of a run, kept for its last evaluation: images of a volume may take minutes
+MAX_EVALUATION_SHARE = 0.03  # of the time so far: after more, no evaluation begins until the last
+MAX_ONE_EVALUATION = 0.1  # of the time of a run: longer ones don't begin; held-out images are faster than training ones
 
 
 class Clock:
@@ -40,7 +42,7 @@ class Clock:
         last = step_seconds / images
         mean = last if self._image_seconds is None else self._image_seconds
         self._image_seconds = SMOOTHING * mean + (1 - SMOOTHING) * last
-        kept = min(self._held_out * self._image_seconds, MAX_HELD_OUT_SHARE * self._limit)
+        kept = min(self._held_out_seconds(), MAX_HELD_OUT_SHARE * self._limit)
         left = self._limit - kept - seconds
         ends = left <= step_seconds
         if ends:
@@ -48,6 +50,14 @@ class Clock:
         else:
             self._position += min(self._steps_left() * step_seconds / left, self._num_steps - self._position)
         return max(int(self._position) - step, 0)
+
+    def allows_evaluation(self, seconds: float, spent: float) -> bool:
+        """Whether held-out images may be evaluated before the last step, `seconds` after the run began, of which
+        earlier evaluations took `spent`."""
+        return spent <= MAX_EVALUATION_SHARE * seconds and self._held_out_seconds() <= MAX_ONE_EVALUATION * self._limit
+
+    def _held_out_seconds(self) -> float:
+        return self._held_out * (self._image_seconds or 0.0)
 
     def _steps_left(self) -> float:
         """Cost of the remaining steps, in units of a step of the present phase."""

@@ -13,7 +13,7 @@ from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.writing import WriteFailed, write_text, writing
 from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.datasets.identity import identity
-from msdgs_train.engine.clock import Clock
+from msdgs_train.engine.clock import MAX_EVALUATION_SHARE, Clock
 from msdgs_train.engine.config import TrainConfig, check_resumable
 from msdgs_train.engine.meters import TrainingDiverged
 from msdgs_train.engine.metrics_log import (
@@ -51,7 +51,6 @@ SELECTION_SPLITS = ("val", "test")  # the first of these that the dataset has se
 RENDERS_PER_EVAL = 4
 MAX_ROLLBACKS = 3
 TRIAL_STEPS = 4  # of a trainer that is thrown away, across the schedule
-MAX_EVALUATION_SHARE = 0.03  # of the time of a run of given minutes: after more, no evaluation begins until the last
 PAUSE_SECONDS = 0.05  # between two calls of `Observer.is_paused`
 
 Status = Literal["finished", "interrupted"]
@@ -291,7 +290,7 @@ class Run:
             self._save()
 
     def _has_time_to_evaluate(self) -> bool:
-        return self.clock is None or self.evaluation_seconds <= MAX_EVALUATION_SHARE * self._seconds()
+        return self.clock is None or self.clock.allows_evaluation(self._seconds(), self.evaluation_seconds)
 
     def _evaluate(self, split: str, *, renders: int | None) -> ImageMetrics:
         """The mean metrics of a split; `renders` renderings, or all, are written beside their images."""

@@ -30,6 +30,7 @@ INIT_SCALE = 0.1  # standard deviation of the planes' first values
 DENSITY_SHIFT, DISTANCE_SCALE = -10.0, 25.0
 STEP = 0.5  # between samples, in vertices
 LEAST_ALPHA = 1e-3  # of a vertex that isn't empty
+LEARNED_ALPHA = 1 - 0.5 ** (1 / DISTANCE_SCALE)  # of a vertex whose samples hide half of what is behind them
 TIME_WEIGHT = 2.0  # of total variation along time
 DECAY = 0.1  # of all rates and of the weight of total variation, over the run
 GROWS_AT, MASKED_AT = (0.12, 0.24, 0.36), (0.16, 0.32, 0.4)
@@ -178,7 +179,7 @@ class HexPlane(RayField):
         grown = [
             (at, partial(self.grow, *size)) for at, size in zip(GROWS_AT, self.config.resolutions()[1:], strict=True)
         ]
-        return sorted([*grown, *((at, self.mask) for at in MASKED_AT)], key=itemgetter(0))
+        return sorted([*grown, *((at, self.mask_if_learned) for at in MASKED_AT)], key=itemgetter(0))
 
     @torch.no_grad()
     def grow(self, resolution: int, times: int) -> None:
@@ -188,16 +189,25 @@ class HexPlane(RayField):
         for planes in (self.density_time, self.color_time):
             _resize(planes, (resolution, times))
 
+    def mask_if_learned(self) -> None:
+        """Find the cells where something is, unless nothing is opaque: after few steps, as runs of given minutes take
+        before the first mask, all cells would be empty, and stay so."""
+        if self._alphas().max() >= LEARNED_ALPHA:
+            self.mask()
+
     @torch.no_grad()
     def mask(self) -> None:
-        """Find the cells where something is at any time; features are linear in time between the vertices of the
-        planes. Cells that were empty before stay so."""
-        step = STEP * (self.corners[1] - self.corners[0]).mean() / (self.resolution - 1)
-        alphas = torch.stack([-torch.expm1(-step * self._densest(x)) for x in range(self.resolution)])
-        cells = occupied_cells(alphas, LEAST_ALPHA)
+        """Find the cells where something is at any time. Cells that were empty before stay so."""
+        cells = occupied_cells(self._alphas(), LEAST_ALPHA)
         if self.cells is not None:
             cells &= functional.interpolate(self.cells[None, None].float(), cells.shape)[0, 0] > 0
         self.cells = cells
+
+    @torch.no_grad()
+    def _alphas(self) -> Tensor:
+        """Largest opacities over time at the vertices, [X, Y, Z]; features are linear in time between vertices."""
+        step = STEP * (self.corners[1] - self.corners[0]).mean() / (self.resolution - 1)
+        return torch.stack([-torch.expm1(-step * self._densest(x)) for x in range(self.resolution)])
 
     def _densest(self, x: int) -> Tensor:
         """Largest density over time, [Y, Z], at vertices of one x."""

@@ -61,6 +61,18 @@ def test_slow_held_out_images_leave_most_of_the_time_for_training() -> None:
     assert seconds == pytest.approx(0.75 * LIMIT, rel=0.01)
 
 
+def test_an_evaluation_of_slow_images_waits_for_the_end_of_the_run() -> None:
+    """40 images of 1 s are more than a tenth of 300 s, of 0.5 s they aren't; 10 s are 3 % of 333."""
+    clock = Clock(STEPS, LIMIT, HELD_OUT, 0)
+    assert clock.allows_evaluation(5.0, 0.0)
+    clock.advance(1, 1.0, 1, 5.0)
+    assert not clock.allows_evaluation(5.0, 0.0)
+    for _ in range(100):
+        clock.advance(1, 0.5, 1, 5.0)
+    assert clock.allows_evaluation(5.0, 0.0)
+    assert [clock.allows_evaluation(seconds, 10.0) for seconds in (330.0, 340.0)] == [False, True]
+
+
 def test_it_goes_on_from_where_a_stopped_run_was() -> None:
     clock = Clock(STEPS, LIMIT, 0, STEPS // 2)
     advances = [clock.advance(STEPS // 2, 1.0, IMAGES, 151.0 + i) for i in range(3)]

@@ -19,7 +19,9 @@ from msdgs_train.evaluation.evaluate import evaluate_run
 from msdgs_train.gaussians.safe_load import CheckpointInvalid
 from msdgs_train.gaussians.stored import load_stored
 from msdgs_train.systems.registry import preset
+from msdgs_train.volumes.hexplane import HexPlaneConfig
 from msdgs_train.volumes.model_file import StoredVolume
+from msdgs_train.volumes.space import Box
 from msdgs_train.volumes.system import VolumeSystem
 from tests.support.training_scene import VOLUMES, StopAfter, assert_same_bits, state_of
 
@@ -46,6 +48,23 @@ def test_it_learns_grows_and_resumes_with_the_same_bits(name: str, data: Path, t
         assert_same_bits(state_of(tmp_path / "whole"), state_of(parts))
     first = Trainer(config, load_scene(data)).system.size
     assert whole.gaussians == load_stored(tmp_path / "whole" / MODEL).size > first
+
+
+def test_no_cell_is_masked_before_something_is_opaque() -> None:
+    """As after few steps. Later a mask leaves where the field is dense at some time, and the cells next to that."""
+    config = HexPlaneConfig(**VOLUMES["hexplane-slim"])
+    field = config.build(Box(-torch.ones(3), torch.ones(3)))
+    field.mask_if_learned()
+    assert field.cells is None
+    with torch.no_grad():
+        for planes in (field.density_space, field.density_time):
+            for plane in planes:
+                plane.zero_()
+        field.density_space[0][:, :, :3, :2] = 1  # y and x
+        field.density_time[0][..., 1] = 1
+    field.mask_if_learned()
+    assert field.cells is not None
+    assert field.cells.sum(dim=(1, 2)).tolist() == [4 * 7] * 3 + [0] * 4
 
 
 def test_it_is_not_resumed_with_steps_that_miss_or_repeat_a_growth(data: Path, tmp_path: Path) -> None:
