@@ -14,6 +14,7 @@ from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
 from msdgs_serve.scene.fields import FieldTable
 
 DEFAULT_FPS = 24.0
+MAX_RADIANS = 3.15
 MIN_FPS, MAX_FPS = 0.01, 240.0
 MAX_NUMBER = 1e9
 """Limit of all numbers in a path, within which single precision neither overflows nor underflows."""
@@ -32,6 +33,9 @@ FIELDS = FieldTable(
 )
 """What is done with each field of nerfstudio's files and their cameras. Its viewer makes `camera_path` of `keyframes`
 and the fields beside them, and its renderer doesn't read these either."""
+OF_CAMERAS = ("camera_to_world", "fov", "render_time", "scene")
+OF_BOTH = ("camera_type", "crop", "aspect")
+"""Fields of each camera, and those of the file and of its cameras; others are of the file."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +88,7 @@ def read_nerfstudio(
     over the path. `size` replaces the size in the file. Raises `InvalidInput` naming the key.
     """
     cameras = _cameras(document)
-    kind = document.get("camera_type", "perspective")
-    if kind != "perspective":
-        raise InvalidInput("camera_type", "perspective", kind if isinstance(kind, str) else type(kind).__name__)
-    if document.get("crop") is not None:
-        raise InvalidInput("crop", "left out: scenes are drawn whole. Switch the viewer's crop off", "a crop")
+    _refuse_kinds(document, "")
     width, height = size or (_integer(document, "render_width"), _integer(document, "render_height"))
     even = even_times(len(cameras), time_range)
     frames = []
@@ -96,7 +96,8 @@ def read_nerfstudio(
         name = f"camera_path.{number}"
         if not isinstance(each, Mapping):
             raise InvalidInput(name, "an object", type(each).__name__)
-        pose = _numbers(each.get("camera_to_world"), 16, f"{name}.camera_to_world").reshape(4, 4)
+        _refuse_kinds(each, f"{name}.")
+        pose = _matrix(each.get("camera_to_world"), f"{name}.camera_to_world")
         (fov_y,) = _numbers([each.get("fov")], 1, f"{name}.fov")
         if not 0 < fov_y < 180:
             raise InvalidInput(f"{name}.fov", "in (0, 180) degrees", fov_y)
@@ -109,8 +110,18 @@ def read_nerfstudio(
     return CameraPath(tuple(frames), _fps(document, len(frames)), _warnings(document, cameras))
 
 
+def _refuse_kinds(fields: Mapping[str, Any], at: str) -> None:
+    kind = fields.get("camera_type") or "perspective"
+    if kind != "perspective":
+        raise InvalidInput(f"{at}camera_type", "perspective", kind if isinstance(kind, str) else type(kind).__name__)
+    if fields.get("crop") is not None:
+        raise InvalidInput(f"{at}crop", "left out: scenes are drawn whole. Switch the viewer's crop off", "a crop")
+
+
 def _cameras(document: Mapping[str, Any]) -> Sequence[Any]:
     cameras = document.get("camera_path")
+    if "frames" in document and cameras is None:
+        raise InvalidInput("camera_path", "a list of cameras, as nerfstudio's viewer saves", "a dataset's `frames`")
     if not isinstance(cameras, Sequence) or isinstance(cameras, str):
         raise InvalidInput("camera_path", "a list of cameras", type(cameras).__name__)
     if not cameras:
@@ -122,9 +133,13 @@ def _cameras(document: Mapping[str, Any]) -> Sequence[Any]:
 
 
 def _warnings(document: Mapping[str, Any], cameras: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    unknown = FIELDS.unlisted(dict.fromkeys([*document, *(name for each in cameras for name in each)]))
-    shown = ", ".join(f"`{name}`" for name in unknown)
-    return (f"not read, as no known field of a camera path: {shown}",) if unknown else ()
+    of_file = [name for name in document if name in OF_CAMERAS or FIELDS.use(name) is None]
+    of_cameras = dict.fromkeys(name for each in cameras for name in each if name not in OF_CAMERAS + OF_BOTH)
+    shown = ", ".join([f"`{name}`" for name in of_file] + [f"`{name}` of cameras" for name in of_cameras])
+    warnings = [f"not read, as no known field of a camera path: {shown}"] if shown else []
+    if all(each["fov"] < MAX_RADIANS for each in cameras):
+        warnings.append(f"each `fov` is below {MAX_RADIANS}, as angles in radians are; it is read in degrees")
+    return tuple(warnings)
 
 
 def read_path_file(path: Path, time_range: tuple[float, float], size: tuple[int, int] | None = None) -> CameraPath:
@@ -152,7 +167,9 @@ def _document(path: Path) -> dict[str, Any]:
         raise InvalidInput("path", "a readable JSON file", f"{path}: {error.strerror}") from None
     except json.JSONDecodeError as error:
         place = f"line {error.lineno}, column {error.colno}"
-        raise InvalidInput("path", "a JSON file", f"{path}, which is none from {place} on") from None
+        raise InvalidInput(
+            "path", "a JSON file of nerfstudio's camera path", f"{path}, which is none from {place} on"
+        ) from None
     except (ValueError, RecursionError):
         raise InvalidInput("path", "a JSON file", f"{path}, which is none") from None
     if not isinstance(document, dict):
@@ -184,16 +201,25 @@ def _fps(document: Mapping[str, Any], count: int) -> float:
 
 def _integer(document: Mapping[str, Any], name: str) -> int:
     value = document.get(name)
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= MAX_PIXELS_PER_SIDE:
         got = value if isinstance(value, float) else type(value).__name__
         raise InvalidInput(name, f"an integer number of pixels in [1, {MAX_PIXELS_PER_SIDE}]", got)
     return value
 
 
+def _matrix(value: Any, name: str) -> np.ndarray:
+    """[4, 4] of 16 numbers by rows, or of four rows."""
+    is_nested = isinstance(value, Sequence) and len(value) == 4 and all(isinstance(row, list) for row in value)
+    return _numbers([number for row in value for number in row] if is_nested else value, 16, name).reshape(4, 4)
+
+
 def _numbers(value: Any, count: int, name: str) -> np.ndarray:
     good = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
     if not good or any(isinstance(each, bool) or not isinstance(each, int | float) for each in value):
-        raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", "another value")
+        got = f"{len(value)} values" if isinstance(value, Sequence) and count > 1 else "another value"
+        raise InvalidInput(name, f"{count} numbers" if count > 1 else "a number", got)
     numbers: list[float] = list(value)
     if not all(-MAX_NUMBER <= each <= MAX_NUMBER for each in numbers):
         raise InvalidInput(name, f"finite and at most {MAX_NUMBER:g}", "NaN, infinity or more")

@@ -156,9 +156,15 @@ class Client:
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         """`seconds` is the time limit of a call. While the service is overloaded, a call but `render_many` is tried up
-        to `tries` times, 1 or more, after the seconds that the service asks for."""
+        to `tries` times, 1 or more, after the seconds that the service asks for. Raises `ClientError` for a URL or key
+        that can't be sent."""
         headers = {} if api_key is None else {"Authorization": f"Bearer {api_key}"}
-        self._http = httpx.Client(base_url=url, headers=headers, timeout=seconds, transport=transport)
+        try:
+            self._http = httpx.Client(base_url=url, headers=headers, timeout=seconds, transport=transport)
+        except httpx.InvalidURL as error:
+            raise ClientError(f"{url}: {error}") from error
+        except UnicodeEncodeError:
+            raise ClientError("the key has characters beyond ASCII") from None
         self._tries = max(tries, 1)
 
     def __enter__(self) -> Self:
@@ -229,7 +235,8 @@ class Client:
         return _read(response, _object, response.content)
 
     def add_scene(self, name: str, file: Path, *, replace: bool = False) -> str:
-        """Add a scene file, if the service allows uploads, and return its SHA-256."""
+        """Add a scene file, if the service allows uploads, and return its SHA-256. Raises `OSError` if it can't be
+        read."""
         query = {"name": name, "replace": str(replace).lower()}
         response = self._call("POST", "/scenes", params=query, content=file.read_bytes())
         return _read(response, lambda text: json.loads(text)["sha256"], response.content)

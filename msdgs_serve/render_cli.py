@@ -112,7 +112,7 @@ def _add_output_options(group: argparse._ArgumentGroup) -> None:
     fps = f"Frames per second of a video; by default the path's, else {DEFAULT_FPS:g}."
     group.add_argument("--fps", type=float, help=fps)
     group.add_argument("--format", choices=get_args(ImageFormat), help="Format of images. (default: png)")
-    quality = f"Quality of jpeg and webp, 1 to 100. (default: {DEFAULT_QUALITY})"
+    quality = f"Quality of jpeg and webp images, 1 to 100. (default: {DEFAULT_QUALITY})"
     group.add_argument("--quality", type=int, metavar="NUMBER", help=quality)
     motion = "EXR and NPY also hold motion vectors, from each frame's time to this much later, in the scene's time."
     group.add_argument("--dt", type=float, metavar="TIME", help=motion)
@@ -128,7 +128,7 @@ def _run(options: argparse.Namespace) -> None:
             expected = f"a folder (of a name with a dot: an existing one), or a video named {names}"
             raise InvalidInput("OUT", expected, options.out.name)
         require_pyav(cast(VideoFormat, video))
-    _refuse(options, ["format"] if is_video else ["fps"], "for images" if is_video else "for a video")
+    _refuse(options, ["format", "quality"] if is_video else ["fps"], "for images" if is_video else "for a video")
     views, fps = _views(options)
     image_format = cast(ImageFormat, options.format or "png")
     transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)

@@ -111,11 +111,12 @@ def _note_placement(out: Path, metadata: SceneMetadata, console: Console) -> Non
     """Tell where the file lies in the world, and write it beside formats that have no place for it."""
     place = metadata.scene_to_world
     left = Similarity(place.scale / _written_units(out, metadata), place.offset)
+    file = out / PLACEMENT if out.is_dir() else out.with_name(f"{out.name}.{PLACEMENT}")
     if left.is_identity or (out.suffix == ONNX and not out.name.endswith(VISIONARY)):
+        file.unlink(missing_ok=True)  # of an earlier file of this name
         return
     where = f"in the transform of its {'node' if out.suffix == '.glb' else 'prim'}"
     if out.suffix not in (*USD, ".glb"):
-        file = out / PLACEMENT if out.is_dir() else out.with_suffix(f".{PLACEMENT}")
         write_text(file, json.dumps(left.to_plain()) + "\n")
         where = f"in {file}"
     x, y, z = left.offset

@@ -4,6 +4,9 @@ from pathlib import Path
 
 from msdgs_serve.scene.errors import MsdgsError
 
+AS_PLY = "write it as a PLY with the program that made it"
+"""What to do with a file of a version that isn't read."""
+
 
 class ImportFailed(MsdgsError):
     """A file or folder can't be read as its format."""

@@ -49,6 +49,11 @@ PARKED_AT = 1e6
 MAX_GAUSSIANS = 1 << 26
 """Gaussians of all frames together."""
 
+LEAST_UNEVEN = 1.01
+"""Ratio of the largest and the smallest difference of the numbers of frames."""
+
+UNEVEN = "the numbers in the names of its frames are unevenly spaced, but frames get evenly spaced times"
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -90,7 +95,8 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
 
     Raises `ImportFailed` if a file can't be read, there is only one, or frames that don't correspond are to be blended.
     """
-    files = frame_files(folder)
+    numbers = frame_files(folder)
+    files = list(numbers)
     if len(files) < 2:
         raise ImportFailed(folder, "holds no two or more numbered .ply, .sog, .spz, .splat or .ksplat files")
     read: list[Splats] = []
@@ -116,7 +122,9 @@ def read_sequence(folder: Path, how: str | None = None, on_frame: Callable[[], o
     problem = None if how == "switch" else _why_not_blended(frames, any(each.dropped for each in read))
     if how == "blend" and problem:
         raise ImportFailed(folder, f"can't be blended: {problem}")
-    warnings = tuple(dict.fromkeys(warning for each in read for warning in each.warnings))
+    steps = np.diff(list(numbers.values()))
+    uneven = [UNEVEN] if steps.max() > LEAST_UNEVEN * steps.min() else []
+    warnings = tuple(dict.fromkeys([*(warning for each in read for warning in each.warnings), *uneven]))
     blended = problem is None and how != "switch"
     return Frames(frames, dropped, read[0].antialiasing, blended, next(iter(ups.values()), None), warnings, offset)
 

@@ -16,6 +16,8 @@ class PathCamera(BaseModel):
         description="4×4 by rows", examples=[[0, 0, 1, 4, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]]
     )
     fov: FieldOfView = Field(description="vertical, degrees")
+    camera_type: Literal["perspective"] | None = Field(default=None, description="no other can be drawn")
+    crop: Any = Field(default=None, description="must be null: scenes are drawn whole")
     render_time: Unit | None = Field(default=None, description="fraction of the time range; default: evenly spaced")
 
 

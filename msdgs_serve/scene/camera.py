@@ -192,6 +192,7 @@ def _rigid(matrix: np.ndarray) -> np.ndarray:
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
         raise InvalidInput(field, "a rotation and a position, without scale or mirroring", rotation.tolist())
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InvalidInput(field, "a matrix whose last row is 0 0 0 1", matrix[3].tolist())
+        by_columns = ", not its last column" if np.abs(matrix[:, 3] - [0, 0, 0, 1]).max() <= 1e-6 else ""
+        raise InvalidInput(field, f"a matrix whose last row is 0 0 0 1{by_columns}", matrix[3].tolist())
     matrix.flags.writeable = False
     return matrix

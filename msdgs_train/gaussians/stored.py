@@ -55,6 +55,12 @@ class StoredModel(Protocol):
 Reader = Callable[[Path, dict[str, Any], SceneInfo], StoredModel]
 """Reads the path, contents and scene of a file. Errors of damaged contents are any that `load_stored` names."""
 
+OTHERS = {
+    frozenset({"splats"}): "gsplat: give the PLY that its trainer writes with --save_ply",
+    frozenset({"pipeline"}): "nerfstudio: give the PLY that ns-export gaussian-splat writes",
+}
+"""Checkpoints of other trainers, by names in them."""
+
 _READERS: dict[str, Reader] = {}
 
 
@@ -77,10 +83,7 @@ def load_stored(path: str | Path) -> StoredModel:
     load_plugins()
     found = contents.get("format") if isinstance(contents, dict) else type(contents).__name__
     if not isinstance(contents, dict) or not isinstance(found, str) or found not in _READERS:
-        known = " or ".join(sorted(_READERS))
-        raise CheckpointInvalid(
-            path, f"isn't a model of format {known} (found {found!r}): train or import it again with this version"
-        )
+        raise CheckpointInvalid(path, _of_others(contents, found))
     missing = [name for name in ("config", "scene", "step", "state") if name not in contents]
     if missing:
         raise CheckpointInvalid(path, f"isn't a complete model: `{missing[0]}` is missing")
@@ -93,6 +96,17 @@ def load_stored(path: str | Path) -> StoredModel:
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError) as error:
         problem = f": {error}" if isinstance(error, MsdgsError) else ", or one of another version"
         raise CheckpointInvalid(path, f"isn't a complete model{problem}") from error
+
+
+def _of_others(contents: Any, found: Any) -> str:
+    """Why a file can't be read, and what to give instead if its trainer is known by it."""
+    if isinstance(found, str) and found.startswith("msdgs-"):
+        known = " or ".join(sorted(_READERS))
+        return f"isn't a model of format {known} (found {found!r}): train or import it again with this version"
+    for keys, trainer in OTHERS.items():
+        if isinstance(contents, dict) and keys <= contents.keys():
+            return f"is a checkpoint of {trainer}"
+    return f"isn't a model of msdgs-train (found {found!r}); of other trainers give the PLY, or the folder of a run"
 
 
 def _refuse_not_finite(path: str | Path, state: dict[str, Tensor]) -> None:

@@ -20,6 +20,7 @@ from msdgs_export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.scene.similarity import Similarity
+from msdgs_train.gaussians.scene_info import SceneInfo
 from tests.support.models import SCENE, random_model
 from tests.support.tolerances import assert_close, tolerance
 
@@ -29,7 +30,10 @@ PLACE = Similarity(100.0, (500_000.0, 5_200_000.0, 800.0))
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     info = dataclasses.replace(SCENE, scene_to_world=PLACE.to_plain())
-    file = tmp_path_factory.mktemp("placed") / "scene.onnx"
+    return written(tmp_path_factory.mktemp("placed") / "scene.onnx", info)
+
+
+def written(file: Path, info: SceneInfo) -> Path:
     baked = bake(random_model(60, noise=0.02, layers=()), info, "0" * 64)
     file.write_bytes(build("network", baked).SerializeToString())
     return file
@@ -53,10 +57,10 @@ def test_the_file_has_the_models_frame_and_its_place(scene: Path):
 @pytest.mark.parametrize(
     ("name", "beside", "left"),
     [
-        ("a.ply", "a.placement.json", Similarity(1.0, PLACE.offset)),
-        ("a.spz", "a.placement.json", PLACE),
+        ("a.ply", "a.ply.placement.json", Similarity(1.0, PLACE.offset)),
+        ("a.spz", "a.spz.placement.json", PLACE),
         ("frames", "frames/placement.json", Similarity(1.0, PLACE.offset)),
-        ("a.visionary.onnx", "a.visionary.placement.json", PLACE),
+        ("a.visionary.onnx", "a.visionary.onnx.placement.json", PLACE),
     ],
 )
 def test_a_format_without_transforms_has_it_beside_its_file(
@@ -71,6 +75,15 @@ def test_a_format_without_transforms_has_it_beside_its_file(
         assert np.abs(got.means - scaled.means).max() <= limit
         assert np.abs(got.scales - scaled.scales).max() <= limit
         assert np.abs(got.means).max() < 1e3
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.spz"])
+def test_no_place_of_an_earlier_file_is_left(scene: Path, tmp_path: Path, name: str):
+    out, place = tmp_path / name, tmp_path / f"{name}.placement.json"
+    converted(scene, out)
+    assert place.exists()
+    converted(written(tmp_path / "at_origin.onnx", SCENE), out)
+    assert not place.exists()
 
 
 def test_gltf_has_it_in_its_node(scene: Path, tmp_path: Path):

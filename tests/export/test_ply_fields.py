@@ -100,6 +100,25 @@ def test_colors_stand_for_sh_of_degree_0_if_there_is_none(tmp_path: Path, kind: 
     assert found.warnings == ()
 
 
+def test_colors_of_floats_that_are_bytes_are_refused(tmp_path: Path):
+    plain = {name: values for name, values in columns(0).items() if not name.startswith("f_dc")}
+    with pytest.raises(ImportFailed, match="`red` is up to 200; as float, colors are from 0 to 1"):
+        read(tmp_path, plain | dict.fromkeys(("red", "green", "blue"), np.full(COUNT, 200.0)))
+
+
+def test_values_that_look_activated_are_told(tmp_path: Path):
+    stored = columns()
+    stored |= {name: np.exp(stored[name]) for name in ("scale_0", "scale_1", "scale_2")}
+    assert not any("logarithms and logits" in warning for warning in read(tmp_path, stored).warnings)
+    stored["opacity"] = 1 / (1 + np.exp(-stored["opacity"]))
+    assert any("logarithms and logits" in warning for warning in read(tmp_path, stored).warnings)
+
+
+def test_sh_of_degree_4_are_named(tmp_path: Path):
+    with pytest.raises(ImportFailed, match="has SH of degree 4; up to 3 can be read: write it with fewer"):
+        read(tmp_path, columns(0) | {f"f_rest_{i}": telling() for i in range(72)})
+
+
 @pytest.mark.parametrize("name", ["red", "green", "blue"])
 def test_colors_beside_sh_change_nothing(tmp_path: Path, name: str):
     assert np.array_equal(

@@ -124,6 +124,7 @@ def test_a_path_file_of_nerfstudio(scene: Path, tmp_path: Path):
         (["missing.onnx", "out"], "missing.onnx"),
         (["scene", "out", "--region", "0", "0", "9999", "1"], "--region"),
         (["scene", "out", "--quality", "80"], "--quality"),
+        (["scene", "video.webp", "--quality", "80"], "left out: it is for images"),
         (["scene", "out", "--elevation", "nan"], "--elevation"),
         (["scene", "out", "--width", "0", "--height", "2"], "--width"),
     ],

@@ -102,11 +102,37 @@ def test_unknown_fields_of_a_path_are_named_once(scene: Path, tmp_path: Path, ca
     for camera in document["camera_path"]:
         camera["shutter"] = 0.5
     assert read_nerfstudio(document, (0.0, 1.0)).warnings == (
-        "not read, as no known field of a camera path: `haze`, `shutter`",
+        "not read, as no known field of a camera path: `haze`, `shutter` of cameras",
     )
     (tmp_path / "path.json").write_text("\ufeff" + json.dumps(document), encoding="utf-8")
     assert main([str(scene), str(tmp_path / "out"), "--path", str(tmp_path / "path.json")]) == 0
     assert f"msdgs-render: warning: {tmp_path / 'path.json'}: not read, as" in capsys.readouterr().err
+
+
+def test_known_fields_in_the_wrong_place_are_not_read():
+    document = nerfstudio(render_time=0.5)
+    document["camera_path"][0]["render_width"] = 9
+    (warning,) = read_nerfstudio(document, (0.0, 1.0)).warnings
+    assert warning.endswith(": `render_time`, `render_width` of cameras")
+
+
+def test_angles_that_may_be_in_radians_are_told():
+    path = read_nerfstudio(nerfstudio(camera_path=[{**CAMERA, "fov": 0.87}] * 2), (0.0, 1.0))
+    assert path.warnings == ("each `fov` is below 3.15, as angles in radians are; it is read in degrees",)
+    assert not read_nerfstudio(nerfstudio(camera_path=[{**CAMERA, "fov": 2}, CAMERA]), (0.0, 1.0)).warnings
+
+
+def test_rows_of_a_matrix_and_whole_sizes_may_be_written_otherwise():
+    rows = np.reshape(CAMERA["camera_to_world"], (4, 4)).tolist()
+    changed = nerfstudio(camera_path=[{**CAMERA, "camera_to_world": rows}] * 2, render_width=float(SIZE))
+    plain = nerfstudio(camera_path=[CAMERA] * 2)
+    assert shown(read_nerfstudio(changed, (0.0, 1.0))) == shown(read_nerfstudio(plain, (0.0, 1.0)))
+
+
+def test_a_matrix_by_columns_is_named():
+    columns = np.reshape(CAMERA["camera_to_world"], (4, 4)).T.ravel().tolist()
+    with pytest.raises(InvalidInput, match="last row is 0 0 0 1, not its last column"):
+        read_nerfstudio(nerfstudio(camera_path=[{**CAMERA, "camera_to_world": columns}]), (0.0, 1.0))
 
 
 def test_a_path_without_cameras_says_what_is_missing(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -115,8 +141,12 @@ def test_a_path_without_cameras_says_what_is_missing(scene: Path, tmp_path: Path
             json.dumps(nerfstudio(camera_path=[])),
             "one camera or more, which nerfstudio's viewer writes if its path",
         ),
-        ("{", "must be a JSON file, got .*, which is none from line 1, column 2 on"),
-        ("\x00", "must be a JSON file, got "),
+        ("{", "must be a JSON file of nerfstudio's camera path, got .*, which is none from line 1, column 2 on"),
+        ("\x00", "must be a JSON file of nerfstudio's camera path, got "),
+        (
+            '{"frames": []}',
+            "camera_path` must be a list of cameras, as nerfstudio's viewer saves, got a dataset's `frames`",
+        ),
     ):
         (tmp_path / "path.json").write_text(text)
         assert main([str(scene), str(tmp_path / "out"), "--path", str(tmp_path / "path.json")]) == 2
@@ -133,6 +163,9 @@ def test_a_path_without_cameras_says_what_is_missing(scene: Path, tmp_path: Path
         ({"fps": None, "seconds": -1}, "seconds"),
         ({"fps": None, "seconds": "1"}, "seconds"),
         ({"camera_type": "fisheye"}, "camera_type"),
+        ({"camera_path": [{**CAMERA, "camera_type": "fisheye"}]}, "camera_path.0.camera_type"),
+        ({"camera_path": [{**CAMERA, "crop": CROP}]}, "camera_path.0.crop"),
+        ({"camera_path": [{**CAMERA, "camera_to_world": [[1, 0], [0, 1]] * 2}]}, "camera_path.0.camera_to_world"),
         ({"camera_path": "x"}, "camera_path"),
         ({"camera_path": [1]}, "camera_path.0"),
         ({"camera_path": [{"camera_to_world": [1] * 15, "fov": 40}]}, "camera_path.0.camera_to_world"),

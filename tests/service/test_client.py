@@ -36,6 +36,9 @@ from tests.support.service import serving
 SIZE = 48
 LEVEL = Orbit(0, 0, distance=5, fov_y=40)
 
+PATIENCE = 600.0
+"""Seconds; the first frame waits for kernels to compile."""
+
 
 @pytest.fixture(scope="module")
 def url(scene: Path) -> Iterator[str]:
@@ -45,7 +48,7 @@ def url(scene: Path) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def client(url: str) -> Iterator[Client]:
-    with Client(url) as client:
+    with Client(url, seconds=PATIENCE) as client:
         yield client
 
 
@@ -177,6 +180,14 @@ def test_names_that_utf8_cannot_hold_are_refused(client: Client):
         client.render(LEVEL, 0.5, scene="\udce9")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "problem"), [({"url": "http://[::1"}, "::1"), ({"api_key": "schlüssel"}, "ASCII")]
+)
+def test_a_url_or_key_that_cannot_be_sent_is_named(arguments: dict[str, Any], problem: str):
+    with pytest.raises(ClientError, match=problem):
+        Client(**arguments)
+
+
 def test_a_background_of_null_stays_in_a_body(client: Client):
     bodies: list[dict[str, Any]] = [{**request_body(LEVEL, 0.5, width=8, height=8), "background": None}]
     assert dict(client.render_many(bodies))[0] == client.render_file(
@@ -252,7 +263,7 @@ def test_many_frames_and_one_that_fails(client: Client):
 def test_scenes_are_listed_added_and_deleted(tmp_path: Path):
     (tmp_path / "scenes").mkdir()
     file = write_scene(tmp_path / "walk.onnx")
-    with serving(tmp_path / "scenes", uploads=True) as http, Client(str(http.base_url)) as client:
+    with serving(tmp_path / "scenes", uploads=True) as http, Client(str(http.base_url), seconds=PATIENCE) as client:
         assert client.ready()
         sha256 = client.add_scene("a walk, öffentlich?", file)
         assert client.scenes() == ["a walk, öffentlich?"]

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msdgs_export.importers.errors import ImportFailed, cut_off
+from msdgs_export.importers.errors import AS_PLY, ImportFailed, cut_off
 from msdgs_export.importers.splats.base import Splats, Stored, parts_of, splats
 from msdgs_serve.scene.fields import FieldTable
 from msdgs_serve.scene.spherical_harmonics import SH_C0, sh_coefficients
@@ -93,7 +93,7 @@ def read_ksplat(file: Path) -> Splats:
         raise cut_off(file, "the header", HEADER_BYTES, len(contents))
     header = Header(*HEADER.unpack_from(contents))
     if (header.major, header.minor) != VERSION:
-        raise ImportFailed(file, f"is .ksplat version {header.major}.{header.minor}; version 0.1 can be read")
+        raise ImportFailed(file, f"is .ksplat version {header.major}.{header.minor}; version 0.1 can be read; {AS_PLY}")
     if header.level > 2:
         raise ImportFailed(file, f"has compression level {header.level}; 0, 1 and 2 are defined")
     data = HEADER_BYTES + SECTION_BYTES * header.max_sections

@@ -17,6 +17,7 @@ from msdgs_export.importers.splats.compressed_ply import compressed
 from msdgs_export.importers.splats.ply_columns import Columns, rest_of
 from msdgs_export.importers.splats.ply_fields import checked_fields
 from msdgs_export.importers.splats.spacetime import is_spacetime, motion_of
+from msdgs_serve.scene.gaussians import Gaussians
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.datasets.common.ply_file import PlyFile, PlyInvalid
 
@@ -30,6 +31,12 @@ BY_BRUSH = "exported from brush"
 """Begins a comment of Brush, whose files all say `Vertical axis: y`, while the scene's own up is what it was."""
 
 SURFELS = "it has no `scale_2`, as 2DGS writes: its surfels are drawn as flat Gaussians, with slightly other edges"
+
+ROUNDING = 1e-6  # of opacities in float32
+ACTIVATED = (
+    "all its scales are above 1 and all opacities from 0.5 to 0.73, as if its `scale_…` and `opacity` were stored as "
+    "they are: programs read them as logarithms and logits"
+)
 
 
 def read_ply(file: Path) -> Splats:
@@ -49,8 +56,15 @@ def read_ply(file: Path) -> Splats:
     else:
         found = splats(file, vertex.rows, (_stored(file, part) for part in vertex.parts(ROWS)))
         warnings += [] if vertex.has("scale_2") else [SURFELS]
+        warnings += [ACTIVATED] if _is_activated(found.gaussians) else []
     up, unknown = _up(contents.comments)
     return replace(found, antialiasing=_antialiasing(contents.comments), up=up, warnings=(*warnings, *unknown))
+
+
+def _is_activated(gaussians: Gaussians) -> bool:
+    """Whether all that was stored is above 0 for log-scales, and in [0, 1] for logits."""
+    low, high = sigmoid(np.array([0.0, 1.0])) + np.array([-ROUNDING, ROUNDING])
+    return bool((gaussians.scales > 1).all() and ((low <= gaussians.opacities) & (gaussians.opacities <= high)).all())
 
 
 def _antialiasing(comments: Sequence[str]) -> str:

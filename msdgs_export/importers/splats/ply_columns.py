@@ -12,6 +12,8 @@ from msdgs_train.datasets.common.ply_file import PlyFile, PlyInvalid
 
 PREFIX = re.compile(r"(scalar_)+", re.IGNORECASE)
 """CloudCompare's, before the names of all properties but positions, normals and colors."""
+MAX_FRACTION = 2.0
+"""Of colors as float: spherical harmonics may be somewhat brighter than white."""
 
 
 class Columns:
@@ -64,9 +66,14 @@ class Columns:
         return column.astype(np.uint32)
 
     def fraction(self, name: str) -> np.ndarray:
-        """A column as float64; integers are divided by the largest of their type."""
-        kind = self._column(name).dtype
-        return self.read(name) / (1.0 if kind.kind == "f" else np.iinfo(kind).max)
+        """A column as float64; integers are divided by the largest of their type. Raises `ImportFailed` for floats that
+        are numbers of bytes."""
+        kind, values = self._column(name).dtype, self.read(name)
+        if kind.kind != "f":
+            return values / np.iinfo(kind).max
+        if (values > MAX_FRACTION).any():
+            raise ImportFailed(self._file, f"`{name}` is up to {values.max():g}; as float, colors are from 0 to 1")
+        return values
 
     def named(self, *names: str) -> np.ndarray:
         return np.stack([self.read(name) for name in names], axis=1)
@@ -89,6 +96,8 @@ class Columns:
 def rest_of(file: Path, columns: Columns, read: Callable[[str], np.ndarray]) -> np.ndarray:
     """[N, C − 1, 3] SH above degree 0, from columns that are sorted by channel."""
     count = columns.count("f_rest_")
+    if count == 72:
+        raise ImportFailed(file, "has SH of degree 4; up to 3 can be read: write it with fewer")
     if count % 3 or count // 3 + 1 not in SH_DEGREES:
         raise ImportFailed(file, f"has {count} of `f_rest_…`; 0, 9, 24 or 45 make whole degrees")
     if not count:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from msdgs_export.importers.errors import ImportFailed
+from msdgs_export.importers.errors import AS_PLY, ImportFailed
 from msdgs_export.importers.splats.base import Splats, Stored, parts_of, smallest_three, splats
 from msdgs_export.importers.splats.webp import read_texture
 from msdgs_serve.scene.fields import FieldTable
@@ -177,7 +177,7 @@ def _decoded(path: Path, read: Callable[[str, int], bytes]) -> Splats:
     meta = _Meta(path, read(META, MAX_META_BYTES))
     if meta.get("version") != 2:
         problem = "of version 1" if meta.get("version") is None else f"of version {meta.get('version')}"
-        raise ImportFailed(path, f"is SOG {problem}; version 2 can be read")
+        raise ImportFailed(path, f"is SOG {problem}; version 2 can be read; {AS_PLY}")
     count = meta.whole("count", MAX_GAUSSIANS)
 
     def texture(name: str, least: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 from typing import NamedTuple
 
-from msdgs_export.importers.errors import ImportFailed, cut_off
+from msdgs_export.importers.errors import AS_PLY, ImportFailed, cut_off
 from msdgs_serve.scene.fields import FieldTable
 
 FIELDS = FieldTable(
@@ -122,11 +122,11 @@ def _header(file: Path, start: bytes) -> Header:
     if magic != MAGIC:
         raise ImportFailed(file, f"isn't an SPZ file: NGSP expected, found {magic!r}")
     if header.version not in (2, 3, 4):
-        raise ImportFailed(file, f"is SPZ version {header.version}; versions 2, 3 and 4 can be read")
+        raise ImportFailed(file, f"is SPZ version {header.version}; versions 2, 3 and 4 can be read; {AS_PLY}")
     if not header.count:
         raise ImportFailed(file, "holds no Gaussians")
     if header.sh_degree > 3:
-        raise ImportFailed(file, f"has SH of degree {header.sh_degree}; up to 3 can be read")
+        raise ImportFailed(file, f"has SH of degree {header.sh_degree}; up to 3 can be read: write it with fewer")
     if header.fractional_bits > 24:
         raise ImportFailed(file, f"has positions with {header.fractional_bits} fractional bits out of 24")
     _check_flags(file, header)
@@ -137,12 +137,11 @@ def _check_flags(file: Path, header: Header) -> None:
     """Raise `ImportFailed` for flags that could change the meaning of anything else."""
     names = [f"flag 0x{1 << bit:02X}" for bit in range(8) if header.flags >> bit & 1]
     unknown = [name for name in names if FIELDS.use(name) == "refused"]
-    remedy = "write it as a PLY with the program that made it"
     if unknown:
-        raise ImportFailed(file, f"has {', '.join(unknown)}, which SPZ 2, 3 and 4 don't define; {remedy}")
+        raise ImportFailed(file, f"has {', '.join(unknown)}, which SPZ 2, 3 and 4 don't define; {AS_PLY}")
     if header.flags & LEVELS and (header.version == 4 or header.flags & EXTENSIONS):
         other = "in version 4" if header.version == 4 else "together with flag 0x02 for extensions"
-        raise ImportFailed(file, f"has flag 0x80 for levels of detail {other}, where its layout isn't known; {remedy}")
+        raise ImportFailed(file, f"has flag 0x80 for levels of detail {other}, where its layout isn't known; {AS_PLY}")
 
 
 def _unzipped(file: Path, contents: bytes) -> tuple[Header, bytes]:

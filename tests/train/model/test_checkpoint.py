@@ -75,7 +75,9 @@ def test_cut_off_files_and_those_of_other_kinds_are_refused(model_file: Path, pa
 @pytest.mark.parametrize(
     ("contents", "message"),
     [
-        ({"weights": torch.zeros(3)}, r"format msdgs-model/2.* \(found None"),
+        ({"weights": torch.zeros(3)}, r"isn't a model of msdgs-train \(found None\); of other trainers give the PLY"),
+        ({"step": 3, "splats": {"means": torch.zeros(3)}}, r"of gsplat: give the PLY .* --save_ply"),
+        ({"step": 3, "pipeline": {}, "optimizers": {}}, r"of nerfstudio: give the PLY that ns-export gaussian-splat"),
         ({"format": "msdgs-model/1"}, r"found 'msdgs-model/1'\): train or import it again"),
         ([1, 2], "found 'list'"),
     ],
