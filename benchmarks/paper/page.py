@@ -114,6 +114,8 @@ def _conditions(results: Results) -> Iterator[str]:
             f"{len(rows)} finished run(s): of the last model, mean ± standard deviation over seeds; seeds {seeds}; "
             f"{results.budget.threads} thread(s) of {machines_of(rows)}; {days[0]} to {days[-1]}."
         )
+        if results.budget.minutes and len({row["machine"] for row in rows}) > 1:
+            yield "A minute has more steps on one machine than on another: compare systems on the same (Runs, below)."
     else:
         yield "No run is finished."
     if absent := [scene for scene in results.table.scenes if scene not in {found.name for found in results.scenes}]:
@@ -222,10 +224,11 @@ def _runs(results: Results) -> Section:
             counts = [f"{statistics.fmean(results.values(method, scene, c)):,.0f}" for c in columns]
             fit = mean_and_deviation(results.values(method, scene, "train_psnr"), 2)
             minutes = f"{statistics.fmean(seconds) / 60:.1f}"
-            layers = _layers(row.configs[scene])
-            lines.append([method.name, row.system, layers, scene, str(len(seconds)), *counts, minutes, fit])
+            layers, of = _layers(row.configs[scene]), [r for r in results.rows if r["scene"] == scene]
+            machines = machines_of([r for r in of if r["system"] == row.system])
+            lines.append([method.name, row.system, layers, scene, str(len(seconds)), *counts, minutes, machines, fit])
     columns = ["", "system", "layers", "scene", "seeds", "parameters", "of modulation", "Gaussians or vertices"]
-    return Section("Runs", [*columns, "steps", "minutes", "PSNR in training, dB"], lines)
+    return Section("Runs", [*columns, "steps", "minutes", "machine", "PSNR in training, dB"], lines)
 
 
 def _settings(results: Results) -> Section:
