@@ -30,10 +30,12 @@ export class Stage {
     return { width: Math.max(1, Math.round(width)), height: Math.max(1, Math.round(height)) };
   }
 
-  /** Set the color around the image to the scene's background, sRGB from 0 to 1; `isAnother`: show nothing else yet. */
-  open(color, isAnother) {
+  /** Take over a scene's background, sRGB from 0 to 1, and proportions; `isAnother`: show nothing else yet. */
+  open({ background: color, view }, isAnother) {
     const background = `rgb(${color.map((x) => Math.round(255 * x)).join(" ")})`;
-    this.canvas.style.background = background;
+    const { style } = this.canvas.parentElement;
+    style.setProperty("--background", background);
+    style.setProperty("--proportion", Math.min(view.width / view.height, 1)); // as in Camera.half
     if (!isAnother) return;
     this.context.fillStyle = background;
     this.context.fillRect(0, 0, this.canvas.width, this.canvas.height);

@@ -67,7 +67,7 @@ export class Viewer {
     document.body.classList.remove("empty");
     this.player.open(scene);
     this.timeline.open();
-    this.stage.open(scene.background, isAnother);
+    this.stage.open(scene, isAnother);
     if (isAnother) {
       this.camera = new Camera(scene.view);
       this.camera.aspect = this.stage.aspect();

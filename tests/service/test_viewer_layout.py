@@ -102,3 +102,22 @@ def test_fingers_find_what_they_touch(browser: Browser, client: httpx.Client):
             page.get_by_role("button", name=opener).click()
             assert page.evaluate(SMALL, 44) == []
             page.locator("dialog[open] button").click()
+        page.set_viewport_size({"width": 740, "height": 330})
+        assert page.locator("#timeline").evaluate("(timeline) => timeline.getBoundingClientRect().bottom") <= 330
+        page.get_by_role("button", name="Help").click()
+        help_text = page.locator("#help")
+        assert help_text.evaluate("(text) => text.scrollHeight > text.clientHeight && text.scrollTop") == 0
+
+
+CHOSEN = """() => [
+    ["#view :checked + span", "#view :not(:checked) + span"],
+    ["#scenes [aria-current]", "#scenes button:not([aria-current])"],
+    ["#loop", "#play"],
+].map((pair) => pair.map((selector) => getComputedStyle(document.querySelector(selector)).backgroundColor))"""
+
+
+def test_what_is_chosen_differs_without_the_colors_of_the_page(page: Page, client: httpx.Client):
+    page.emulate_media(forced_colors="active")
+    open_page(page, client, f"#scene={LONG}")
+    for chosen, other in page.evaluate(CHOSEN):
+        assert chosen != other

@@ -15,7 +15,7 @@ const STATIC = { first: { slot: 0 }, second: { slot: 0 }, share: 0, isExact: tru
  * Load a scene, and return an `Engine` that draws it, until the canvas loses its context. Rejects with an Error whose
  * message is for people if the scene, the runtime or WebGL2 can't be used.
  * @param {object} options
- * @param {HTMLCanvasElement} options.canvas  one without a context yet
+ * @param {HTMLCanvasElement} options.canvas  one without a context yet; it is hidden until it has a frame
  * @param {string | ArrayBuffer} options.scene  the address of the scene file, or its contents, which the caller loses; it
  *   may be gzipped
  * @param {{module: string, glue: string, binary: string}} options.runtime  addresses of onnxruntime-web's files

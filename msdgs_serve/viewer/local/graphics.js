@@ -14,6 +14,7 @@ const CONTEXT = { alpha: false, antialias: false, depth: false, stencil: false, 
 
 /** The WebGL2 context of a canvas that has none yet. Throws an Error for people if there is none. */
 export function contextOf(canvas) {
+  canvas.hidden = true; // until it has a frame: it is black
   const gl = canvas.getContext("webgl2", CONTEXT);
   if (!gl) throw new Error("This browser doesn’t draw with WebGL2, or it is switched off.");
   return gl;
@@ -77,6 +78,7 @@ export class Graphics {
     this.resolve.use();
     this.resolve.bind(this.frame.textures);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    canvas.hidden = false;
   }
 
   #project(view, before, after, share, channel) {
