@@ -32,9 +32,20 @@ export class Camera {
     this.elevation = 20;
     this.distance = this.view.distance;
     this.target = [...this.view.target];
-    this.fovY = this.view.fov_y;
-    this.proportion = this.view.width / this.view.height;
+    this.setLens();
     this.sceneCamera = null;
+  }
+
+  /** Set the vertical field of view in degrees, and width / height of what it is for; by default those of the view. */
+  setLens({ fov = this.view.fov_y, proportion = this.view.width / this.view.height } = {}) {
+    [this.fovY, this.proportion] = [fov, proportion];
+  }
+
+  /** What of the lens differs from the view's, for `setLens`. */
+  get ownLens() {
+    const { fov_y, width, height } = this.view;
+    const [fov, proportion] = [short(this.fovY), short(this.proportion)];
+    return { ...(fov !== short(fov_y) && { fov }), ...(proportion !== short(width / height) && { proportion }) };
   }
 
   /** Use the exact pose of a stored camera of the scene, until the camera is moved. */

@@ -3,7 +3,8 @@
 import { short } from "./camera.js";
 
 const RUN_SECONDS = 4; // for the whole time range at speed 1, if the scene doesn't say how long it lasts
-const TIME_STEPS = 240; // distinct times during playback, whose poses the service caches
+const STEPS_PER_SECOND = 60; // distinct times during playback at speed 1, whose poses the service caches
+const MIN_STEPS = 240; // enough for short scenes at the lowest speed
 export const SPEEDS = [0.25, 0.5, 1, 2];
 
 export class Player {
@@ -34,6 +35,11 @@ export class Player {
     return this.duration ?? RUN_SECONDS;
   }
 
+  /** Number of steps of the whole time range. */
+  get steps() {
+    return Math.max(MIN_STEPS, Math.round(STEPS_PER_SECOND * this.seconds));
+  }
+
   /** Return the scene's time at a fraction of its range, exact at both ends. */
   at(place) {
     const [first, last] = this.range;
@@ -52,7 +58,7 @@ export class Player {
   }
 
   step(count) {
-    this.seek(Math.round(this.place * TIME_STEPS + count) / TIME_STEPS);
+    this.seek(Math.round(this.place * this.steps + count) / this.steps);
   }
 
   /** Play, if anything changes with time. */
@@ -70,6 +76,6 @@ export class Player {
       return;
     }
     this.exact %= 1;
-    this.place = this.isSmooth ? this.exact : Math.floor(this.exact * TIME_STEPS) / TIME_STEPS;
+    this.place = this.isSmooth ? this.exact : Math.floor(this.exact * this.steps) / this.steps;
   }
 }

@@ -43,7 +43,7 @@ export function toHash({ scene, camera, player, layers, view }) {
   const { azimuth, elevation, distance, target, sceneCamera } = camera;
   const lengths = [distance, ...target].map((x) => short(x, distance));
   const free = [short(azimuth), short(elevation), ...lengths].join(",");
-  const at = sceneCamera === null ? { at: free } : { camera: sceneCamera };
+  const at = sceneCamera === null ? { at: free, ...camera.ownLens } : { camera: sceneCamera };
   const steps = layers.steps === null ? {} : { steps: layers.steps };
   return `#${new URLSearchParams({ scene: scene.name, t: player.t, ...steps, view, ...at })}`.replaceAll("%2C", ",");
 }
@@ -52,7 +52,8 @@ export function toHash({ scene, camera, player, layers, view }) {
 export function fromHash(hash) {
   const given = new URLSearchParams(hash.slice(1));
   const at = (given.get("at") ?? "").split(",").map(Number);
-  const [t, steps, sceneCamera] = ["t", "steps", "camera"].map((name) => (given.has(name) ? Number(given.get(name)) : NaN));
+  const number = (name) => (given.has(name) ? Number(given.get(name)) : NaN);
+  const [t, steps, sceneCamera, fov, proportion] = ["t", "steps", "camera", "fov", "proportion"].map(number);
   return {
     scene: given.get("scene"),
     view: given.get("view"),
@@ -60,5 +61,6 @@ export function fromHash(hash) {
     steps: Number.isFinite(steps) ? steps : null,
     sceneCamera: Number.isInteger(sceneCamera) ? sceneCamera : null,
     at: at.length === 6 && at.every(Number.isFinite) && at[2] > 0 ? at : null,
+    lens: { fov: fov > 0 && fov < 180 ? fov : undefined, proportion: proportion > 0 ? proportion : undefined },
   };
 }

@@ -130,13 +130,15 @@ export class Viewer {
     this.stage.tell({ ...facts, label: this.source.label });
     if (facts.full) history.replaceState(null, "", toHash(this));
     this.host.shown(facts);
+    if (facts.full && !this.isMoving) history.replaceState(null, "", toHash(this));
   }
 
-  #apply({ t = null, steps, at = null, sceneCamera = null }) {
+  #apply({ t = null, steps, at = null, lens, sceneCamera = null }) {
     if (t !== null) this.player.seekTime(t);
     if (steps !== undefined) this.layers.set(steps); // null in an address without them: all
     if (at) {
       this.camera.reset();
+      this.camera.setLens(lens);
       [this.camera.azimuth, this.camera.elevation, this.camera.distance] = at;
       this.camera.target = at.slice(3);
     }

@@ -11,7 +11,7 @@ from playwright.sync_api import Page
 from msdgs_serve.scene import Camera
 from msdgs_serve.scene.camera import orbit
 from tests.service.conftest import open_page
-from tests.support.processes import bodies, forget, wait_until_still
+from tests.support.processes import bodies, forget, image, wait_for, wait_until_still
 from tests.support.scene_files import metadata, write_scene
 from tests.support.service import serving
 
@@ -41,6 +41,47 @@ def test_an_address_shows_what_it_shows_in_a_new_tab(page: Page, tmp_path: Path)
         open_page(page, client, address)
         assert asked[-1] == in_a_new_tab
         assert page.locator("#camera").input_value() == ""
+
+
+def test_an_address_has_the_lens_of_the_camera_that_was_moved(page: Page, tmp_path: Path):
+    first, second = metadata().cameras
+    narrow = replace(second, camera=Camera.from_fov(second.camera.camera_to_world, 32, 64, 20.0))
+    write_scene(tmp_path / "ball.onnx", cameras=(first, narrow))
+    with serving(tmp_path) as client:
+        page.set_viewport_size({"width": 390, "height": 844})
+        asked = bodies(page)
+        open_page(page, client, "#scene=ball&camera=1")
+        press(page, "ArrowUp")
+        moved, address = asked[-1], page.url.removeprefix(f"{client.base_url}/")
+        open_page(page, client, "#scene=ball&camera=0")
+        press(page, "ArrowUp")
+        assert "fov" not in page.url
+        page.goto("about:blank")
+        open_page(page, client, address)
+        assert asked[-1] == moved
+
+
+def strongest_in_the_middle(image: np.ndarray) -> int:
+    return int(image[image.shape[0] // 2, image.shape[1] // 2].argmax())
+
+
+def test_changed_files_are_shown(page: Page, tmp_path: Path):
+    file = write_scene(tmp_path / "ball.onnx", static_color=(1.0, 0.0, 0.0), moving=0)
+    with serving(tmp_path) as client:
+        open_page(page, client, "#camera=1")
+        wait_for(lambda: strongest_in_the_middle(image(page)) == 0)
+        assert page.locator("#camera").input_value() == "1"
+        write_scene(tmp_path / "new", static_color=(0.0, 1.0, 0.0), moving=0).rename(file)
+        wait_for(lambda: strongest_in_the_middle(image(page)) == 1)
+        write_scene(tmp_path / "new", moving=0, cameras=metadata().cameras[:1]).rename(file)
+        page.wait_for_function("() => location.hash.includes('at=')")
+        assert page.locator("#camera option").all_inner_texts() == ["Free view", "view_0"]
+        away = file.rename(tmp_path / "away")
+        page.get_by_text("ball is gone.").wait_for()
+        forget(page)
+        away.rename(file)
+        wait_until_still(page)
+        assert not page.locator("#banner").is_visible()
 
 
 def test_the_camera_has_the_view_of_a_changed_file(page: Page, tmp_path: Path):

@@ -74,6 +74,41 @@ def test_times_are_distinct_in_range_and_exact_at_both_ends(modules: Page, first
     assert sought == times, "as the address gives them"
 
 
+@pytest.mark.parametrize("duration", [1, 4, 60, 3600])
+def test_playback_has_other_times_with_each_frame_however_long_the_scene_is(modules: Page, duration: float):
+    script = """async (duration) => {
+        const { Player } = await import("/viewer/player.js");
+        const player = new Player();
+        player.open({ time_range: [0, duration], duration, changes: true });
+        player.start();
+        const times = Array.from({ length: 29 }, () => (player.advance(1 / 30), player.t));
+        player.seek(0);
+        player.step(1);
+        return [times, player.t]; }"""
+    times, step = modules.evaluate(script, duration)
+    assert len(set(times)) == len(times)
+    assert 0 < step <= 1 / 30
+
+
+@pytest.mark.parametrize(
+    ("parts", "lens"),
+    [
+        ("", {}),
+        ("fov=77.3", {"fov": 77.3}),
+        ("fov=20&proportion=0.5", {"fov": 20, "proportion": 0.5}),
+        ("fov=0&proportion=0", {}),
+        ("fov=180&proportion=-1", {}),
+        ("fov=wide&proportion=", {}),
+        ("fov=Infinity&proportion=NaN", {}),
+    ],
+)
+def test_impossible_lenses_of_links_are_left_out(modules: Page, parts: str, lens: dict[str, float]):
+    script = """async (parts) => {
+        const { fromHash } = await import("/viewer/share.js");
+        return JSON.parse(JSON.stringify(fromHash(`#at=0,0,1,0,0,0&${parts}`).lens)); }"""
+    assert modules.evaluate(script, parts) == lens
+
+
 @pytest.mark.parametrize(("first", "last"), [(0, 1), (-1.605, 0.016)])
 def test_motion_ends_within_the_range_of_times(modules: Page, first: float, last: float):
     script = """async (range) => {

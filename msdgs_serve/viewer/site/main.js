@@ -10,15 +10,22 @@ import { description, sceneFile } from "./files.js";
 const RUNTIME = "onnxruntime-web/";
 const IS_CALM = matchMedia("(prefers-reduced-motion: reduce)").matches;
 
-const viewer = new Viewer({ shown: () => document.getElementById("preview")?.remove() });
+let plays = false; // from the first frame on, before it puts its time into the address
+const viewer = new Viewer({ shown });
 const source = new LocalSource(viewer, { runtime: RUNTIME, file: sceneFile });
 viewer.use(source);
 
 async function start() {
   const look = fromHash(location.hash);
   const scene = await description();
+  plays = scene.changes && look.t === null && !IS_CALM;
   await viewer.open(scene, look);
-  if (scene.changes && look.t === null && !IS_CALM) viewer.timeline.toggle();
+}
+
+function shown() {
+  document.getElementById("preview")?.remove();
+  if (plays && !viewer.player.playing) viewer.timeline.toggle();
+  plays = false;
 }
 
 async function guarded(action) {
