@@ -6,3 +6,8 @@ export function say(text) {
   if (banner.textContent !== text) banner.textContent = text; // else it is read aloud again
   banner.hidden = !text;
 }
+
+/** Take back a text, unless another one has replaced it. */
+export function unsay(text) {
+  if (document.getElementById("banner").textContent === text) say("");
+}

@@ -96,7 +96,7 @@ export class Controls {
     else if (event.key === "+" || event.key === "=") camera.zoom(1 / KEY_ZOOM);
     else if (event.key === "-") camera.zoom(KEY_ZOOM);
     else {
-      if (event.key === " " && !isFree(event.target, this.canvas)) return;
+      if (event.key === " " && event.target.closest("button, a")) return;
       if (this.host.command(event.key)) event.preventDefault();
       return;
     }
@@ -108,5 +108,5 @@ export class Controls {
 const isTyping = (target) =>
   target.closest("select, textarea, dialog, input:not([type=range], [type=radio])") !== null;
 
-/** Whether no other element handles this key. */
+/** Whether no other element handles arrows. */
 const isFree = (target, canvas) => target === canvas || target === document.body;

@@ -1,5 +1,6 @@
 // The section with what can be taken away: a link, a command, files.
 
+import { unsay } from "./banner.js";
 import { copy, save } from "./share.js";
 
 const TOLD_FOR = 2500; // milliseconds
@@ -15,12 +16,19 @@ export class Exports {
     [this.told, this.dialog, this.title, this.text] = ["told", "text-dialog", "text-title", "text"].map(find);
     for (const button of document.querySelectorAll("[data-take]")) {
       const kind = button.dataset.take;
-      button.addEventListener("click", () => guarded(async () => this.#give(kind, await takes[kind]())));
+      button.addEventListener("click", () => guarded(() => this.#take(kind, takes[kind])));
     }
   }
 
-  #give(kind, taken) {
-    return typeof taken === "string" ? this.#copy(kind, taken) : save(taken.contents, taken.name);
+  async #take(kind, take) {
+    unsay(this.problem);
+    try {
+      const taken = await take();
+      await (typeof taken === "string" ? this.#copy(kind, taken) : save(taken.contents, taken.name));
+    } catch (error) {
+      this.problem = error.message; // which `guarded` tells
+      throw error;
+    }
   }
 
   /** Copy a text, or show it selected if the browser forbids that. */

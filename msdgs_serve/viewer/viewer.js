@@ -111,8 +111,9 @@ export class Viewer {
   }
 
   setView(view) {
-    notice(this.views.show(view));
-    this.source.change({ cut: true });
+    const lack = this.views.show(view);
+    notice(lack);
+    if (!lack) this.source.change({ cut: true });
   }
 
   /** Stop at the shown time. */
@@ -128,7 +129,6 @@ export class Viewer {
   /** A source has shown a frame. */
   shown(facts) {
     this.stage.tell({ ...facts, label: this.source.label });
-    if (facts.full) history.replaceState(null, "", toHash(this));
     this.host.shown(facts);
     if (facts.full && !this.isMoving) history.replaceState(null, "", toHash(this));
   }
@@ -177,12 +177,13 @@ export class Viewer {
   #command(key) {
     const view = this.views.names[Number(key) - 1];
     const { changes } = this.player;
+    const letter = key.toLowerCase(); // with Caps Lock, too
     if (view) this.setView(view);
     else if (key === " " && changes) this.timeline.toggle();
     else if (key === "," && changes) this.timeline.step(-1);
     else if (key === "." && changes) this.timeline.step(1);
-    else if (key === "r") this.#reset();
-    else if (key === "f") this.#fillScreen();
+    else if (letter === "r") this.#reset();
+    else if (letter === "f") this.#fillScreen();
     else if (key === "?") find("help").showModal();
     else return false;
     return true;

@@ -145,8 +145,12 @@ def test_motion_is_offered_only_where_there_is_some(page: Page, client: httpx.Cl
     page.get_by_text("Depth", exact=True).click()
     expect(page.locator("#notice")).to_be_empty()
     page.get_by_text("Motion", exact=True).click(force=True)
-    expect(page.locator("#notice")).to_contain_text("Nothing moves")
-    page.wait_for_function("() => location.hash.includes('view=rgb')")
+    expect(page.locator("#notice")).to_have_text("Nothing moves in this scene that could be shown as motion.")
+    expect(page.get_by_label("Depth")).to_be_checked()
+    forget(page)
+    page.locator("#image").press("ArrowLeft")
+    wait_until_still(page)
+    assert asked[-1]["channels"] == ["depth"]
     assert not any("motion" in body.get("channels", ()) for body in asked)
     page.locator("#scenes").get_by_text("balls").click()
     page.get_by_text("Motion", exact=True).click()
@@ -154,7 +158,7 @@ def test_motion_is_offered_only_where_there_is_some(page: Page, client: httpx.Cl
     forget(page)
     page.locator("#scenes").get_by_text(scene, exact=True).click()
     wait_until_still(page)
-    expect(page.locator("#notice")).to_contain_text("Nothing moves")
+    expect(page.locator("#notice")).to_contain_text("as motion: this is the color.")
     assert "channels" not in asked[-1]
 
 

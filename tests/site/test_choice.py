@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from msdgs_serve.browser import RUNTIME_FILES, runtime_files
 from msdgs_serve.scene.errors import InvalidInput
@@ -14,7 +14,7 @@ from tests.support.pages import watched_page
 from tests.support.processes import forget, wait_until_still
 from tests.support.scene_files import write_scene
 from tests.support.service import serving
-from tests.support.sites import NO_WEBGL2, RUNTIME, needs_runtime, psnr, stand_in
+from tests.support.sites import LOSE, LOST, NO_WEBGL2, RUNTIME, needs_runtime, psnr, stand_in
 from tests.support.tolerances import tolerance
 
 pytestmark = pytest.mark.slow
@@ -68,23 +68,36 @@ def test_both_draw_the_same_also_with_a_key_and_after_the_file_has_changed(brows
     (tmp_path / "keys").write_text(f"read {KEY}")
     settings: dict[str, Any] = {"onnxruntime_web": RUNTIME, "api_keys_file": tmp_path / "keys"}
     with serving(tmp_path, **settings) as client, watched_page(browser, reduced_motion="reduce") as page:
-        page.goto(f"{client.base_url}/#scene=ball&t=0.75")
+        page.goto(f"{client.base_url}/#scene=ball&t=0.75&camera=1")
         page.locator("#key").fill(KEY)
         page.get_by_role("button", name="Use it").click()
+        wait_until_still(page)
+        with_borders = stage(page)
+        forget(page)
+        page.locator("#image").press("r")
+        for _ in range(12):
+            page.keyboard.press("+")
         wait_until_still(page)
         served = stage(page)
         draw_here(page)
         expect(page.locator("#status")).to_contain_text("drawn here")
         assert psnr(stage(page), served) >= tolerance("drawn_here_db")
+        forget(page)
+        page.select_option("#camera", "1")
+        wait_until_still(page)
+        assert psnr(stage(page), with_borders) >= tolerance("drawn_here_db"), "beside a stored camera"
 
         forget(page)
         write_scene(tmp_path / "new", static_color=(0.0, 0.0, 1.0), moving=0).rename(file)
         page.wait_for_function("() => document.querySelector('#timeline').hidden")
         wait_until_still(page)
         here = stage(page)
+        page.evaluate(LOSE)
+        expect(page.locator("#banner")).to_contain_text(LOST)
         page.locator("#source").get_by_text("Service").click()
         expect(page.locator("#status")).to_contain_text("drawn by the service")
         wait_until_still(page)
+        expect(page.locator("#banner")).to_be_hidden()
         assert page.locator("#image + canvas").count() == 0
         assert psnr(here, stage(page)) >= tolerance("drawn_here_db")
 
@@ -99,3 +112,21 @@ def test_if_this_browser_cannot_the_service_draws(browser: Browser, scene: Path)
         expect(page.locator("#banner")).to_contain_text("WebGL2")
         expect(page.locator("#source [value=service]")).to_be_checked()
         wait_until_still(page)
+
+
+def test_who_was_chosen_last_draws(page: Page, scene: Path, tmp_path: Path):
+    held: list[Route] = []
+    with serving(scene, onnxruntime_web=stand_in(tmp_path / "runtime")) as client:
+        page.route("**/local/source.js", lambda route: held.append(route))
+        page.goto(str(client.base_url))
+        wait_until_still(page)
+        with page.expect_request("**/local/source.js"):
+            page.locator("#source").get_by_text("Here").click()
+        page.locator("#source").get_by_text("Service").click()
+        held[0].continue_()
+        page.evaluate("async () => void (await import('/viewer/local/source.js'))")
+        forget(page)
+        page.locator("#image").press("ArrowLeft")
+        wait_until_still(page)
+        expect(page.locator("#status")).to_contain_text("drawn by the service")
+        expect(page.get_by_label("Motion")).to_be_enabled()

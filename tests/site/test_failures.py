@@ -13,19 +13,11 @@ from playwright.sync_api import Page, expect
 
 from tests.support.processes import forget, wait_until_still
 from tests.support.scene_files import write_scene
-from tests.support.sites import NO_WEBGL2, needs_runtime, picture
+from tests.support.sites import LOSE, LOST, NO_WEBGL2, needs_runtime, picture
 
 pytestmark = [pytest.mark.slow, needs_runtime]
 
 SCENE = "scene.onnx.gz"
-
-LOSE = """() => {
-    const graphics = document.querySelector("#image + canvas").getContext("webgl2");
-    window.context = graphics.getExtension("WEBGL_lose_context");
-    context.loseContext();
-}"""
-"""Takes the graphics from a page; `context.restoreContext()` gives them back."""
-LOST = "The browser has taken the graphics from this page."
 
 
 def missing(site: Path) -> None:

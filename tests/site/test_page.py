@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, Route, expect
 
+from tests.support.images import decode
 from tests.support.pages import watched_page
 from tests.support.processes import ROOT, forget, wait_until_still
 from tests.support.sites import drawn_by_the_service, needs_runtime, picture, psnr
@@ -44,8 +45,10 @@ def comes_to_rest(page: Page) -> bool:
     return False
 
 
-def time_of(page: Page) -> float:
-    return float(page.locator("#time-text").inner_text().removeprefix("t "))
+def red(page: Page) -> int:
+    """How many pixels of the image on the page are more red than anything else."""
+    pixels = decode(page.locator(".stage").screenshot(), "png")[0][..., :3].astype(int)
+    return int((pixels[..., 0] > pixels[..., 1:].max(axis=-1) + 50).sum())
 
 
 def test_it_plays_from_the_folder_alone(page: Page, site: Path, server: str):
@@ -56,6 +59,7 @@ def test_it_plays_from_the_folder_alone(page: Page, site: Path, server: str):
     page.get_by_role("button", name="Pause").wait_for()
     expect(page.locator("#status")).to_contain_text("drawn here")
     page.wait_for_function("() => Number(document.getElementById('time').value) > 0.1")
+    assert page.url == f"{server}/site/", "who opens the address again doesn't see it play"
     assert page.locator("#preview").count() == 0
     assert page.title() == page.locator("h1").inner_text() == "Balls"
     assert [url for url in asked if not url.startswith((f"{server}/site/", "blob:"))] == []
@@ -97,7 +101,7 @@ def test_it_draws_what_the_service_draws_and_fills_the_screen(browser: Browser, 
             assert psnr(got, wanted) >= tolerance("drawn_here_db")
         page.get_by_role("button", name="Full screen").click()
         page.wait_for_function("() => document.fullscreenElement?.matches('main')")
-        page.keyboard.press("f")
+        page.keyboard.press("F")
         page.wait_for_function("() => !document.fullscreenElement")
         with page.expect_download() as download:
             page.get_by_role("button", name="Download the file").click()
@@ -113,6 +117,25 @@ def test_in_a_frame_of_another_page_it_has_the_stage_alone(page: Page, folder: P
     box = inside.locator(".stage").bounding_box()
     assert box is not None
     assert box["height"] > 250
+    for width, height, last in ((480, 300, "#status"), (320, 180, "#timeline")):
+        page.locator("iframe").evaluate(
+            "(frame, size) => Object.assign(frame, size)", {"width": width, "height": height}
+        )
+        ends = inside.locator(last).evaluate("(line) => [line.getBoundingClientRect().bottom, innerHeight]")
+        assert ends[0] <= ends[1] == height
+        assert inside.locator("#image").evaluate("(image) => image.clientHeight") > 100
+
+
+def test_in_a_frame_without_an_origin_it_says_what_the_frame_needs(
+    browser: Browser, folder: Path, site: Path, server: str
+):
+    (folder / "sandbox.html").write_text(
+        '<iframe src="site/" width="500" height="400" sandbox="allow-scripts"></iframe>'
+    )
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"{server}/sandbox.html")
+        expect(page.frame_locator("iframe").locator("#banner")).to_contain_text("allow-same-origin")
 
 
 def test_opened_as_a_file_it_says_what_to_do(browser: Browser, site: Path):
@@ -144,13 +167,16 @@ def test_the_command_is_one_of_the_system(page: Page, host: str, path: str, fold
 def test_while_it_loads_it_shows_the_preview_and_counts_bytes(page: Page, site: Path, server: str):
     held: list[Route] = []
     page.emulate_media(reduced_motion="reduce")
+    page.set_viewport_size({"width": 390, "height": 844})
     page.route("**/scene.onnx.gz", lambda route: held.append(route))
     with page.expect_request("**/scene.onnx.gz"):
         page.goto(f"{server}/site/")
     expect(page.locator("#loading")).to_be_visible()
     assert page.locator("#preview").is_visible()
+    preview = red(page)
     held[0].continue_()
     wait_until_still(page)
+    assert preview == pytest.approx(red(page), rel=0.05), "another size than what follows"
     assert not page.locator("#loading").is_visible()
 
     page.unroute("**/scene.onnx.gz")

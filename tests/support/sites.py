@@ -36,6 +36,15 @@ NO_WEBGL2 = """{
 }"""
 """Takes WebGL2 from a page."""
 
+LOSE = """() => {
+    const graphics = document.querySelector("#image + canvas").getContext("webgl2");
+    window.context = graphics.getExtension("WEBGL_lose_context");
+    context.loseContext();
+}"""
+"""Takes the graphics from a page; `context.restoreContext()` gives them back."""
+LOST = "The browser has taken the graphics from this page."
+"""What the page says then."""
+
 needs_runtime = pytest.mark.skipif(
     not RUNTIME.is_dir(), reason=f"no {MODULES.relative_to(ROOT)}: `make {MODULES.relative_to(ROOT)}`"
 )

@@ -1,6 +1,6 @@
 // The source of pixels that this browser is: it poses and draws the scene's file.
 
-import { say } from "../banner.js";
+import { say, unsay } from "../banner.js";
 import { depthRange, pinhole } from "../camera.js";
 import { size } from "../numbers.js";
 import { CHANNELS, openEngine } from "./engine.js";
@@ -65,6 +65,7 @@ export class LocalSource {
     this.paused = true;
     this.isIdle = true;
     this.#close();
+    unsay(this.problem);
   }
 
   /** Width and height of the image in pixels. */
@@ -93,7 +94,7 @@ export class LocalSource {
       canvas.addEventListener("webglcontextlost", (event) => {
         if (canvas !== this.canvas) return; // `#close` gave it back
         event.preventDefault(); // so that it is restored
-        say(LOST);
+        this.#fail(LOST);
       });
       canvas.addEventListener("webglcontextrestored", () => canvas === this.canvas && this.#reload());
       const engine = await openEngine({
@@ -101,7 +102,7 @@ export class LocalSource {
         scene: contents,
         runtime: this.runtime,
         onProgress: (bytes) => this.#showProgress(bytes),
-        onError: (error) => say(error.message),
+        onError: (error) => this.#fail(error.message),
       });
       if (number !== this.number) return engine.dispose();
       this.engine = engine;
@@ -120,9 +121,15 @@ export class LocalSource {
 
   /** Open the scene again, all of whose arrays were lost with the graphics. */
   async #reload() {
-    say("");
+    unsay(this.problem);
     this.sha256 = null;
-    await this.open(this.viewer.scene).catch((error) => say(error.message));
+    await this.open(this.viewer.scene).catch((error) => this.#fail(error.message));
+  }
+
+  /** Say what is wrong, as long as this source draws. */
+  #fail(text) {
+    this.problem = text;
+    say(text);
   }
 
   #close() {

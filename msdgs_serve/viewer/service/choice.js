@@ -18,27 +18,30 @@ export class Choice {
     try {
       await action();
     } catch (error) {
-      if (this.viewer.source === this.frames) throw error;
+      if (this.chosen === "service") throw error;
       this.form.elements.source.value = "service";
       await this.#choose("service");
       this.failed(error);
     }
   }
 
+  get chosen() {
+    return this.form.elements.source.value;
+  }
+
   async #choose(name) {
     const { viewer } = this;
-    viewer.use(name === "local" ? await this.#local() : this.frames);
+    const source = name === "local" ? await this.#local() : this.frames;
+    if (name !== this.chosen) return; // meanwhile the user has chosen the other one
+    viewer.use(source);
     if (!viewer.scene) return;
     viewer.offerViews();
     await viewer.source.open(viewer.scene);
   }
 
   async #local() {
-    if (!this.local) {
-      const { LocalSource } = await import("../local/source.js");
-      this.local = new LocalSource(this.viewer, { runtime: this.runtime, file });
-    }
-    return this.local;
+    const { LocalSource } = await import("../local/source.js");
+    return (this.local ??= new LocalSource(this.viewer, { runtime: this.runtime, file }));
   }
 }
 

@@ -1,9 +1,13 @@
-// Says why nothing happens if the page was opened as a file, from which browsers load no modules, or if one is missing.
+// Says why nothing happens if the page was opened as a file, or in a frame without an origin, from which browsers load no
+// modules, or if one is missing.
 
 document.querySelector("script[type=module]").addEventListener("error", () => {
   if (location.protocol === "file:") return;
   const banner = document.getElementById("banner");
-  banner.textContent = "A file of this page is missing below viewer/: the folder has to be copied as a whole.";
+  banner.textContent =
+    self.origin === "null"
+      ? "The frame that this page is in keeps it from its files: the frame’s sandbox attribute needs allow-same-origin."
+      : "A file of this page is missing below viewer/: the folder has to be copied as a whole.";
   banner.hidden = false;
 });
 if (location.protocol === "file:") {
