@@ -103,7 +103,9 @@ def test_fingers_find_what_they_touch(browser: Browser, client: httpx.Client):
             assert page.evaluate(SMALL, 44) == []
             page.locator("dialog[open] button").click()
         page.set_viewport_size({"width": 740, "height": 330})
-        assert page.locator("#timeline").evaluate("(timeline) => timeline.getBoundingClientRect().bottom") <= 330
+        assert (
+            page.locator("#timeline").evaluate("(timeline) => timeline.getBoundingClientRect().bottom + scrollY") <= 330
+        )
         page.get_by_role("button", name="Help").click()
         help_text = page.locator("#help")
         assert help_text.evaluate("(text) => text.scrollHeight > text.clientHeight && text.scrollTop") == 0
