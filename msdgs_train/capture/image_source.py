@@ -4,14 +4,12 @@ import io
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-import OpenImageIO as oiio
 
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.pictures import Picture, fitted
-from msdgs_train.datasets.common.images import composite, read_rgba
+from msdgs_train.datasets.common.images import ImageHeader, composite, read_header, read_rgba
 from msdgs_train.datasets.common.name_fields import natural_order
 from msdgs_train.datasets.common.name_times import NameWithoutTime, readings
 from msdgs_train.datasets.common.readers import DatasetInvalid
@@ -111,25 +109,12 @@ def in_srgb(pixels: np.ndarray, profile: bytes) -> np.ndarray:
     return np.array(image)
 
 
-class _Header(NamedTuple):
-    """What an image says of itself."""
-
-    width: int
-    height: int
-    orientation: int  # EXIF's number
-    profile: bytes  # ICC, empty if there is none
-
-
 @cache
-def _header(file: Path) -> _Header:
-    reader = oiio.ImageInput.open(str(file))
-    if reader is None:
-        raise _unreadable(file, f"can't be read: {oiio.geterror().splitlines()[0]}")
-    spec = reader.spec()
-    reader.close()
-    profile = spec.getattribute("ICCProfile")
-    stored = b"" if profile is None else np.asarray(profile, np.uint8).tobytes()
-    return _Header(spec.width, spec.height, int(spec.getattribute("Orientation") or 1), stored)
+def _header(file: Path) -> ImageHeader:
+    try:
+        return read_header(file)
+    except DatasetInvalid as error:
+        raise _unreadable(file, error.problem) from None
 
 
 def _unreadable(file: Path, problem: str) -> CaptureFailed:
@@ -138,12 +123,12 @@ def _unreadable(file: Path, problem: str) -> CaptureFailed:
         return CaptureFailed(
             file, f"is {kind}, which isn't read: convert all images to JPEG or PNG, of their full size"
         )
-    return CaptureFailed(file, f"{problem}. Convert it to JPEG or PNG")
+    return CaptureFailed(file, problem)
 
 
 def _shown_size(file: Path) -> tuple[int, int]:
-    header = _header(file)
-    return (header.height, header.width) if header.orientation >= 5 else (header.width, header.height)
+    (width, height), orientation, _ = _header(file)
+    return (height, width) if orientation >= 5 else (width, height)
 
 
 def _times(names: list[str]) -> list[float]:

@@ -9,9 +9,12 @@ import OpenImageIO as oiio
 from msdgs_serve.files import scratch_file
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.writing import writing
+from msdgs_train.datasets.common import jpeg
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
+COPY_AGAIN = "copy it again from where it came"
+CONVERT = "convert it to PNG of 8 or 16 bits, with the colors that a screen shows"
 HALF = 0.5 + 1e-9
 """Added before rounding down, so that halves go up whatever the error of the division before."""
 
@@ -31,12 +34,27 @@ class ImageSize(NamedTuple):
         return min(*self, *other) > 0 and 100 * abs(across - down) <= down
 
 
-def read_size(path: Path) -> ImageSize:
-    """Read the size in an image's header. Raises `DatasetInvalid`."""
+class ImageHeader(NamedTuple):
+    """What an image says of itself."""
+
+    size: ImageSize  # as it is stored
+    orientation: int  # EXIF's number, 1 if it is shown as it is stored
+    profile: bytes  # ICC, empty if there is none
+
+
+def read_header(path: Path) -> ImageHeader:
+    """Read an image's header. Raises `DatasetInvalid`."""
     reader = _open(path)
     spec = reader.spec()
     reader.close()
-    return ImageSize(spec.width, spec.height)
+    profile = spec.getattribute("ICCProfile")
+    stored = b"" if profile is None else np.asarray(profile, np.uint8).tobytes()
+    return ImageHeader(ImageSize(spec.width, spec.height), int(spec.getattribute("Orientation") or 1), stored)
+
+
+def read_size(path: Path) -> ImageSize:
+    """Read the size in an image's header. Raises `DatasetInvalid`."""
+    return read_header(path).size
 
 
 def read_rgba(path: Path) -> np.ndarray:
@@ -54,10 +72,12 @@ def read_pixels(path: Path, dtype: str) -> np.ndarray:
     """Read [H, W, channels] as "uint8" or "uint16", whose largest value is that of the file's type."""
     reader = _open(path)
     pixels = reader.read_image(dtype)
-    problem = reader.geterror()
+    problem, is_jpeg = reader.geterror(), reader.format_name() == "jpeg"
     reader.close()
     if pixels is None:
-        raise _unreadable(path, problem.splitlines()[0] if problem else "no pixels")
+        raise _unreadable(path, f"{problem.splitlines()[0] if problem else 'no pixels'}: {COPY_AGAIN}")
+    if is_jpeg and not jpeg.is_whole(path.read_bytes()):
+        raise DatasetInvalid(path, "image", f"is cut off: {COPY_AGAIN}")
     return pixels
 
 
@@ -137,15 +157,33 @@ def _area_means(rgba: np.ndarray, means: np.ndarray) -> None:
 
 
 def _open(path: Path) -> "oiio.ImageInput":  # quoted, or OpenImageIO's bindings report leaks after `--help`
-    straight = oiio.ImageSpec()
-    straight.attribute("oiio:UnassociatedAlpha", 1)
-    reader = oiio.ImageInput.open(str(path), straight)
-    if reader is None:
-        raise _unreadable(path, oiio.geterror().splitlines()[0])
+    reader = _opened(path)
     spec = reader.spec()
     if spec.format.basetype not in (oiio.UINT8, oiio.UINT16) or spec.nchannels > 4:
         reader.close()
-        raise _unreadable(path, f"{spec.nchannels} channels of {spec.format}; 1 to 4 of 8 or 16 bits are supported")
+        raise _unreadable(
+            path, f"{spec.nchannels} channels of {spec.format}; 1 to 4 of 8 or 16 bits are supported: {CONVERT}"
+        )
+    return reader
+
+
+def _opened(path: Path) -> "oiio.ImageInput":
+    """A reader of the file, of Ultra HDR that of its image for usual screens."""
+    try:
+        with path.open("rb") as file:
+            has_gain_map = jpeg.has_gain_map(file.read(jpeg.HEAD))
+    except OSError as error:
+        raise _unreadable(path, str(error.strerror)) from None
+    straight = oiio.ImageSpec()
+    straight.attribute("oiio:UnassociatedAlpha", 1)
+    if has_gain_map:
+        with scratch_file() as (scratch, _):
+            Path(scratch).write_bytes(jpeg.without_gain_map(path.read_bytes()))
+            reader = oiio.ImageInput.open(scratch, straight)
+    else:
+        reader = oiio.ImageInput.open(str(path), straight)
+    if reader is None:
+        raise _unreadable(path, f"{oiio.geterror().splitlines()[0]}: {COPY_AGAIN}, or convert it to JPEG or PNG")
     return reader
 
 

@@ -54,6 +54,13 @@ def unequal(folder: Path) -> Path:
     return images
 
 
+def cut_off(folder: Path) -> Path:
+    images = folder_of(folder, "cut")
+    content = cv2.imencode(".jpg", picture(0))[1].tobytes()
+    stored(images, "a.jpg", content[: len(content) // 2])
+    return images
+
+
 def half(folder: Path, ending: str, muxer: dict[str, str] | None = None, part: float = 0.6) -> Path:
     rng = np.random.default_rng(0)
     noise = [np.clip(im + rng.normal(0, 20, im.shape), 0, 255).astype(np.uint8) for im in pictures(24)]
@@ -72,7 +79,8 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a folder of videos": (lambda folder: folder_of(folder, "clips", "a.mp4"), r"but videos such as a\.mp4"),
     "a folder of folders": (lambda folder: folder_of(folder, "rig", "cam0"), "but folders such as cam0"),
     "images of a phone": (lambda folder: folder_of(folder, "phone", "a.HEIC"), r"a\.HEIC: is HEIC, .* convert .* JPEG"),
-    "a damaged image": (lambda folder: folder_of(folder, "bad", "a.png"), r"a\.png: can.t be read: .* Convert it"),
+    "a damaged image": (lambda folder: folder_of(folder, "bad", "a.png"), r"a\.png: can.t be read: .* convert it"),
+    "an image that is cut off": (cut_off, r"a\.jpg: is cut off: copy it again"),
     "images of two sizes": (unequal, r"2\.png: is 96×62, but 1\.png is 96×64: give images of one size"),
     "all black": (lambda folder: write_clip(folder / "a.mp4", [np.zeros((64, 96, 3), np.uint8)] * 9), "is black"),
     "all gray": (lambda folder: write_clip(folder / "a.mp4", [np.full((64, 96, 3), 99, np.uint8)] * 9), "of one color"),

@@ -5,10 +5,12 @@ from pathlib import Path
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from PIL import Image
 
-from msdgs_train.datasets import composite
+from msdgs_train.datasets import DatasetInvalid, composite
 from msdgs_train.datasets.common.images import read_rgba, read_size, resize_area, write_png
 from tests.support.tolerances import assert_close
+from tests.train.datasets.jpegs import jpeg, ultra_hdr
 
 
 def image(seed: int, width: int, height: int) -> np.ndarray:
@@ -100,3 +102,36 @@ def test_sixteen_bits_are_read_as_eight(tmp_path: Path):
     writer.write_image(np.array([[[0, 257, 65535], [257 * 100, 257 * 200, 257 * 201]]], np.uint16))
     writer.close()
     assert read_rgba(path).tolist() == [[[0, 1, 255, 255], [100, 200, 201, 255]]]
+
+
+KINDS = {"baseline": {}, "progressive": {"progressive": True}, "with restarts": {"restart_marker_blocks": 3}}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_jpeg_that_is_cut_off_is_refused(tmp_path: Path, kind: str):
+    content = jpeg(image(0, 64, 48)[..., :3], comment=b"\xff\xd9", **KINDS[kind])
+    path = tmp_path / "image.jpg"
+    for length in range(len(content) // 2, len(content), 97):
+        path.write_bytes(content[:length])
+        with pytest.raises(DatasetInvalid, match=r"image\.jpg: `image` is cut off: copy it again"):
+            read_rgba(path)
+    for after in (b"", b"\0" * 9, b"\xff\xd8 another image or a video"):
+        path.write_bytes(content + after)
+        assert read_rgba(path).shape == (48, 64, 4)
+
+
+@pytest.mark.parametrize("ending", ["webp", "tif", "bmp", "gif"])
+def test_other_images_that_are_cut_off_are_refused(tmp_path: Path, ending: str):
+    path = tmp_path / f"image.{ending}"
+    Image.fromarray(image(0, 64, 48)[..., :3]).save(path)
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(DatasetInvalid, match="copy it again"):
+        read_rgba(path)
+
+
+def test_of_ultra_hdr_the_image_for_usual_screens_is_read(tmp_path: Path):
+    pixels = np.indices((48, 64, 3)).sum(axis=0).astype(np.uint8)
+    (tmp_path / "usual.jpg").write_bytes(jpeg(pixels))
+    (tmp_path / "hdr.jpg").write_bytes(ultra_hdr(pixels))
+    assert read_size(tmp_path / "hdr.jpg") == (64, 48)
+    np.testing.assert_array_equal(read_rgba(tmp_path / "hdr.jpg"), read_rgba(tmp_path / "usual.jpg"))

@@ -94,7 +94,7 @@ def test_float_images_are_refused(tmp_path: Path):
     writer.close()
     content["frames"][0]["file_path"] = "train/r_0.exr"
     write_png(tmp_path / "train" / "r_0.exr.png", flat(0, CENTERED))  # the exact name is tried first
-    with pytest.raises(DatasetInvalid, match="4 channels of float; 1 to 4 of 8 or 16 bits are supported"):
+    with pytest.raises(DatasetInvalid, match="4 channels of float; 1 to 4 of 8 or 16 bits are supported: convert it"):
         load_scene(write_dnerf(tmp_path, splits={"train": content}))
 
 
