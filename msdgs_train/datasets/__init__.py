@@ -5,7 +5,7 @@ from pathlib import Path
 
 from msdgs_train.datasets.colmap.loader import SPARSE, load_colmap
 from msdgs_train.datasets.common.images import composite
-from msdgs_train.datasets.common.intrinsics import principal_point_warnings
+from msdgs_train.datasets.common.intrinsics import check_intrinsics
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame, SceneData
 from msdgs_train.datasets.common.times import NAMES, timed
@@ -45,7 +45,7 @@ def load_scene(
             own = None if has_times else NAMES  # COLMAP stores no times
             read = replace(load(folder, size), layout=layout)
             scene = timed(read, folder, own if time_from is None else time_from).in_unit_time()
-            scene = replace(scene, warnings=(*scene.warnings, *principal_point_warnings(scene)))
+            scene = replace(scene, warnings=(*scene.warnings, *check_intrinsics(scene, folder)))
             scene = scene if masks else scene.without_masks()
             return scene.split_again(llffhold) if llffhold else scene
     markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)

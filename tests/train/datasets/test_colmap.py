@@ -72,3 +72,10 @@ def test_invalid_poses_are_refused(tmp_path: Path, ending: str, pose: tuple[floa
     folder = write_colmap(tmp_path, names=("0.png",), ending=ending, poses=[pose])
     with pytest.raises(DatasetInvalid, match=rf"images\.{ending}: `images\[0\.png\]\.{message}"):
         load_scene(folder)
+
+
+def test_intrinsics_of_larger_images_are_refused(tmp_path: Path):
+    folder = write_colmap(tmp_path, ending="txt")
+    (folder / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 320 240 600 600 320 240\n")
+    with pytest.raises(DatasetInvalid, match=r"`principal points` .* the center of images 2 times as wide"):
+        load_scene(folder)

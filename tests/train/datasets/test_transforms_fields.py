@@ -239,16 +239,43 @@ def test_a_principal_point_off_the_center_is_read(tmp_path: Path, layout: str):
         assert (scene.splits["train"][0].camera.cx, scene.warnings) == (cx, ())
 
 
-OUTSIDE: list[tuple[float, float, str]] = [(-3.0, 12.0, "check cx"), (64.0, 48.0, "4 times as wide"), (16.0, 24.5, "c")]
+FAR = [
+    *((-3.0, 12.0, "check cx"), (16.0, 24.5, "check cx"), (16.0, 24.0, "check cx"), (3.0, 23.0, "check cx")),
+    *((30.4, 22.8, "1.9 times as wide"), (8.0, 6.0, "0.5 times as wide"), (4.0, 3.0, "0.25 times as wide")),
+]
 
 
 @each_layout
-@pytest.mark.parametrize(("cx", "cy", "hint"), OUTSIDE)
-def test_a_principal_point_outside_of_the_image_is_told(tmp_path: Path, layout: str, cx: float, cy: float, hint: str):
+@pytest.mark.parametrize(("cx", "cy", "hint"), FAR)
+def test_a_principal_point_far_from_the_middle_is_told(tmp_path: Path, layout: str, cx: float, cy: float, hint: str):
     (warning,) = load_scene(write(tmp_path, layout, cx=cx, cy=cy)).warnings
-    assert "the principal point of 2 of 2 images lies outside of them, first of " in warning
+    assert "the principal point of 2 of 2 images is far from their middle, first of " in warning
     assert f": ({cx:g}, {cy:g}) in 32×24" in warning
-    assert hint in warning.rpartition(": ")[2]
+    assert hint in warning.rpartition("empty: ")[2]
+
+
+IMPOSSIBLE = [
+    *((32.0, 24.0, "2 times as wide"), (64.0, 48.0, "4 times as wide"), (2.0, 1.5, "0.125 times as wide")),
+    *((0.5, 0.5, "from the upper left corner"), (-1.2, 0.7, "from the upper left corner")),
+]
+
+
+@each_layout
+@pytest.mark.parametrize(("cx", "cy", "hint"), IMPOSSIBLE)
+def test_principal_points_in_a_corner_of_all_images_are_refused(
+    tmp_path: Path, layout: str, cx: float, cy: float, hint: str
+):
+    with pytest.raises(DatasetInvalid, match=rf"`principal points` lie .* \({cx:g}, {cy:g}\) in 32×24; .*{hint}"):
+        load_scene(write(tmp_path, layout, cx=cx, cy=cy))
+    tiles = load_scene(write(tmp_path, layout, {"cx": 0.0, "cy": 24.0}, cx=cx, cy=cy))
+    assert "2 of 2 images is far" in tiles.warnings[0]
+
+
+@each_layout
+@pytest.mark.parametrize("focal", [1.1, 0.035])
+def test_focal_lengths_in_other_units_are_refused(tmp_path: Path, layout: str, focal: float):
+    with pytest.raises(DatasetInvalid, match=rf"`focal lengths` of {focal:g} pixels in 32×24 are too short"):
+        load_scene(write(tmp_path, layout, fl_x=focal))
 
 
 CONTRADICTIONS: list[Callable[..., Path]] = [
