@@ -1,4 +1,5 @@
-"""COLMAP layout: a sparse model in `sparse/0` or `sparse`, binary or text, and the images in `images`.
+"""COLMAP layout: a sparse model in `sparse/0` or `sparse`, binary or text, and the images in `images`. Of `sparse/0`,
+`sparse/1`, … the model with most images is read.
 
 Poses map world to camera in OpenCV axes and pixel centers are at half-integers, both as in `Camera`. Images of
 the models SIMPLE_RADIAL, RADIAL and OPENCV are undistorted by `Frame.load_rgba`, bilinearly, to a pinhole camera with
@@ -10,7 +11,9 @@ images' names. The first image, in the order of names, and every 8th after it ar
 """
 
 import math
+import os
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
@@ -21,8 +24,9 @@ from msdgs_train.datasets.colmap import text as colmap_text
 from msdgs_train.datasets.colmap.model import ModelCamera, ModelImage
 from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
 from msdgs_train.datasets.common.extent import scene_half_size
-from msdgs_train.datasets.common.images import ImageSize, read_size
+from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
 from msdgs_train.datasets.common.masks import checked_mask, find_mask
+from msdgs_train.datasets.common.name_fields import natural_order
 from msdgs_train.datasets.common.paths import find_file, not_found, posix
 from msdgs_train.datasets.common.readers import DatasetInvalid, finite_rows
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, hold_out, reduced
@@ -33,31 +37,67 @@ SPARSE, IMAGES, MASKS = "sparse", "images", "masks"
 
 def load_colmap(folder: Path, size: int | None = None) -> SceneData:
     """Read the cameras and sparse points of a COLMAP scene, as `load_scene` does."""
-    files = _model_files(folder)
-    read = colmap_binary if files[0].suffix == ".bin" else colmap_text
-    cameras = dict(read.read_cameras(files[0]))
-    images = sorted(read.read_images(files[1]), key=lambda image: image.name)
+    models = [(files, _images(files)) for files in _model_files(folder)]
+    files, images = max(models, key=lambda model: len(model[1]))
     if not images:
         raise DatasetInvalid(files[1], "images", "must be one or more")
+    cameras = dict(_reader(files).read_cameras(files[0]))
     frames = [_frame(folder, files, image, cameras.get(image.camera_id), size) for image in images]
     frames = with_stored_times(frames, folder)
-    points, colors = _points(files[2], list(read.read_points(files[2])))
+    points, colors = _points(files[2], list(_reader(files).read_points(files[2])))
     half_size = scene_half_size(points, [frame.camera for frame in frames])
-    warnings = _mask_warnings(folder / MASKS, frames)
+    warnings = _pose_warnings(folder, files[0].parent, frames, len(models)) + _mask_warnings(folder / MASKS, frames)
     return SceneData(hold_out(frames), half_size, points, colors, unsplit=frames, warnings=warnings)
 
 
-def _model_files(folder: Path) -> list[Path]:
-    """Find the files `cameras`, `images` and `points3D`."""
-    for place in (folder / SPARSE / "0", folder / SPARSE):
-        for ending in (".bin", ".txt"):
-            files = [place / f"{part}{ending}" for part in ("cameras", "images", "points3D")]
-            if files[0].is_file():
-                for file in files[1:]:
-                    if not file.is_file():
-                        raise DatasetInvalid(file, "file", f"is missing beside {files[0].name}")
-                return files
-    raise DatasetInvalid(folder / SPARSE, "cameras", "is missing: there is no cameras.bin or cameras.txt, here or in 0")
+def _model_files(folder: Path) -> list[list[Path]]:
+    """Find the files `cameras`, `images` and `points3D` of each model."""
+    sparse = folder / SPARSE
+    numbered = [place for place in sparse.glob("*") if place.name.isdecimal()]
+    places = [*sorted(numbered, key=lambda place: natural_order(place.name)), sparse]
+    found = [files for place in places if (files := _files_in(place))]
+    if not found:
+        raise DatasetInvalid(sparse, "cameras", "is missing: there is no cameras.bin or cameras.txt, here or in 0")
+    whole = [files for files in found if all(file.is_file() for file in files)]
+    if not whole:
+        missing = next(file for file in found[0] if not file.is_file())
+        raise DatasetInvalid(missing, "file", f"is missing beside {found[0][0].name}")
+    return [files for files in whole if files[0].parent != sparse] or whole
+
+
+def _files_in(place: Path) -> list[Path]:
+    """The files that a model in this folder has, binary before text; none if it has no cameras."""
+    for ending in (".bin", ".txt"):
+        files = [place / f"{part}{ending}" for part in ("cameras", "images", "points3D")]
+        if files[0].is_file():
+            return files
+    return []
+
+
+def _reader(files: list[Path]) -> ModuleType:
+    return colmap_binary if files[0].suffix == ".bin" else colmap_text
+
+
+def _images(files: list[Path]) -> list[ModelImage]:
+    return sorted(_reader(files).read_images(files[1]), key=lambda image: image.name)
+
+
+def _pose_warnings(folder: Path, model: Path, frames: list[Frame], models: int) -> tuple[str, ...]:
+    """A warning if the model that is read has no poses for some images."""
+    used = {os.path.abspath(frame.image_path) for frame in frames}
+    endings = {*EXTENSIONS, *(frame.image_path.suffix.lower() for frame in frames)}
+    names = [
+        path.relative_to(folder).as_posix() for path in (folder / IMAGES).rglob("*") if path.suffix.lower() in endings
+    ]
+    shown = [name for name in names if "mask" not in name.lower() and "/." not in name]
+    without = sorted(name for name in shown if os.path.abspath(folder / name) not in used)
+    if not without:
+        return ()
+    problem = f"{len(without)} of {len(without) + len(frames)} images have no pose in {model} and are left out, first "
+    problem += f"{without[0]}: what only they show, and when it moves, isn't learned. "
+    if models > 1:
+        problem += f"It is the largest of {models} models, each in axes of its own. "
+    return (problem + "Register them with COLMAP, or remove them",)
 
 
 def _frame(folder: Path, files: list[Path], image: ModelImage, camera: ModelCamera | None, size: int | None) -> Frame:

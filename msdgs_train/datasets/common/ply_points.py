@@ -7,6 +7,8 @@ import numpy as np
 from msdgs_train.datasets.common.ply_file import PlyFile, PlyInvalid
 from msdgs_train.datasets.common.readers import DatasetInvalid, finite_rows
 
+WHITES = (2**8 - 1, 2**16 - 1, 2**32 - 1)
+"""Largest values of integer colors, the first that holds all of a file's, since types are often larger than needed."""
 POSITION, COLOR = ("x", "y", "z"), ("red", "green", "blue")
 
 
@@ -14,7 +16,7 @@ def read_ply_points(file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Read points, [M, 3] float64 in the axes and units of the file, and their colors, [M, 3] float64 in [0, 1].
 
     Both are None if the file has no points, colors also if its vertices have no red, green and blue. Integer colors are
-    divided by the largest value of their type. Raises `DatasetInvalid` naming file and field.
+    divided by the first of `WHITES` that none is above. Raises `DatasetInvalid` naming file and field.
     """
     try:
         vertices = PlyFile(file).read("vertex")
@@ -37,8 +39,9 @@ def _colors(file: Path, vertices: np.ndarray) -> np.ndarray | None:
     kinds = vertices.dtype
     if not all(name in (kinds.names or ()) and kinds[name].kind in "fiu" for name in COLOR):
         return None
-    largest = [np.iinfo(kinds[name]).max if kinds[name].kind in "iu" else 1.0 for name in COLOR]
-    colors = _columns(vertices, COLOR) / largest
+    colors = _columns(vertices, COLOR)
+    if any(kinds[name].kind in "iu" for name in COLOR):
+        colors /= next(white for white in WHITES if colors.max() <= white)
     if not ((colors >= 0) & (colors <= 1)).all():
         raise DatasetInvalid(file, "property red", "green and blue must be in [0, 1], or integers of 0 and more")
     return colors

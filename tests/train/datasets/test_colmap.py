@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from msdgs_train.datasets import DatasetInvalid, load_scene
+from msdgs_train.datasets import DatasetInvalid, Frame, load_scene
 from tests.support.tolerances import assert_close
 from tests.train.datasets.layouts import COLMAP_POINTS, points_of, write_colmap
 
@@ -79,3 +79,36 @@ def test_intrinsics_of_larger_images_are_refused(tmp_path: Path):
     (folder / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 320 240 600 600 320 240\n")
     with pytest.raises(DatasetInvalid, match=r"`principal points` .* the center of images 2 times as wide"):
         load_scene(folder)
+
+
+NAMES = tuple(f"v_{index}.png" for index in range(5))
+
+
+@both
+def test_the_largest_model_is_read_and_images_without_a_pose_are_told(tmp_path: Path, ending: str):
+    folder = write_colmap(tmp_path, names=NAMES[:2], ending=ending)
+    write_colmap(tmp_path, names=NAMES[1:4], ending=ending, place="1")
+    assert [frame.name for frame in frames_of(folder)] == ["v_1", "v_2", "v_3"]
+    (warning,) = load_scene(folder).warnings
+    assert warning.startswith(
+        f"1 of 4 images have no pose in {folder / 'sparse' / '1'} and are left out, first images/v_0"
+    )
+    assert "the largest of 2 models" in warning
+    (folder / "sparse" / "1" / f"images.{ending}").unlink()
+    (warning,) = load_scene(folder).warnings
+    assert warning.startswith("2 of 4 images have no pose")
+    assert "models" not in warning
+
+
+def test_a_model_may_have_any_number(tmp_path: Path):
+    folder = write_colmap(tmp_path, names=NAMES, place="1")
+    for hidden in ("._v_0.png", "v_0_mask.png", "masks/v_0.png", "v_0.txt"):
+        (folder / "images" / hidden).parent.mkdir(exist_ok=True)
+        (folder / "images" / hidden).write_bytes(b"-")
+    assert len(frames_of(folder)) == 5
+    assert load_scene(folder).warnings == ()
+
+
+def frames_of(folder: Path) -> list[Frame]:
+    splits = load_scene(folder).splits.values()
+    return sorted((frame for frames in splits for frame in frames), key=lambda frame: frame.name)

@@ -175,6 +175,23 @@ def test_sparse_points_come_with_their_colors_in_the_axes_of_the_poses(tmp_path:
     assert_close(colors, [[1.0, 0.0, 0.2], [0.0, 0.4, 1.0]], "sh_basis")
 
 
+@pytest.mark.parametrize(
+    ("kind", "color", "expected"),
+    [
+        ("int", "200 100 50", (200 / 255, 100 / 255, 50 / 255)),
+        ("ushort", "255 0 51", (1.0, 0.0, 0.2)),
+        ("ushort", "65535 0 13107", (1.0, 0.0, 0.2)),
+        ("uint", "4294967295 0 858993459", (1.0, 0.0, 0.2)),
+        ("double", "0.5 0.25 1", (0.5, 0.25, 1.0)),
+    ],
+)
+def test_colors_of_wide_types_are_read_by_their_values(tmp_path: Path, kind: str, color: str, expected: tuple):
+    header = "\n".join([*HEADER[:10], "end_header", ""]).format("ascii").replace("uchar", kind)
+    (tmp_path / "points.ply").write_text(f"{header}0 0 1 {color}\n1 0 1 {color}\n")
+    _, colors = points_of(load_scene(write_nerfstudio(tmp_path, content=nerfstudio_json(ply_file_path="points.ply"))))
+    assert_close(colors, [expected, expected], "sh_basis")
+
+
 def without_color(content: bytes) -> bytes:
     return content.replace(b"uchar red", b"uchar other")
 
