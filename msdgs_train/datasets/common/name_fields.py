@@ -1,8 +1,8 @@
 """The numbers in the names of images, as fields that all names have.
 
 A number is an integer, a decimal (`t_0.25`), a date with or without a clock (`IMG_20240131_235958_123`), a clock
-(`00-01-02.500`) or an epoch (`1706745600123`). All names decide together: a form that doesn't fit all of them, or that
-would join a grid of two numbers (`cam1.0001`), is read as separate numbers.
+(`00-01-02.500`), a time in units (`1m02s500ms`) or an epoch (`1706745600123`). All names decide together: a form that
+doesn't fit all of them, or that would join a grid of two numbers (`cam1.0001`), is read as separate numbers.
 """
 
 import itertools
@@ -22,24 +22,28 @@ DATE = (
 )
 BETWEEN = r"(?:[-_.]*T?[-_.]*|[-_.\s]+|\s+at\s+)"
 CLOCK = rf"(?:{HOUR}(?P<{{0}}>[-_.:]?){SIXTY}(?P={{0}}){SIXTY}|{HOUR}h{SIXTY}m{SIXTY})"
+AFTER_DATE = rf"(?:{CLOCK}|(?<!\d)\d(?P<{{0}}b>[-_.:]){SIXTY}(?P={{0}}b){SIXTY})"
 MINUTES = rf"{HOUR}[-_.:h]?{SIXTY}"
+TO_MINUTES_OR_MORE = rf"(?:{AFTER_DATE.format('colon2')}(?:[.,]\d+)?|{MINUTES})"
 SUBSECOND = r"(?:\d{9}|\d{6}|\d{3})(?!\d)"
 HALF_DAY = r"(?:\s?[AaPp][Mm]\b)?"
+UNITS = r"(?:(?P<h>\d+)h)?(?:(?P<m>\d+)m)?(?P<s>\d+(?:[.,]\d+)?)s(?:(?P<f>\d{3})(?!\d)|(?P<ms>\d+)ms)?"
 DAY = 86_400
 """Seconds."""
 SIGN = r"(?:(?:(?<![\w.)-])|(?<=_))-)?"
 FORMS = {
-    "stamp_fraction": rf"{DATE.format('dash1')}{BETWEEN}{CLOCK.format('colon1')}[-_]?{SUBSECOND}",
-    "stamp": rf"{DATE.format('dash2')}(?:{BETWEEN}(?:{CLOCK.format('colon2')}(?:[.,]\d+)?|{MINUTES}){HALF_DAY})?(?!\d)",
+    "stamp_fraction": rf"{DATE.format('dash1')}{BETWEEN}{AFTER_DATE.format('colon1')}[-_s]?{SUBSECOND}",
+    "stamp": rf"{DATE.format('dash2')}(?:{BETWEEN}{TO_MINUTES_OR_MORE}{HALF_DAY})?(?!\d)",
     "epoch": r"(?<!\d)1\d{9}(?:\d{9}|\d{6}|\d{3})?(?!\d)(?:\.\d+|[-_]\d{9}(?!\d))?",
-    "clock": rf"(?<!\d)(?!\d+_\d){CLOCK.format('colon3')}(?:[.,]\d+)?{HALF_DAY}(?!\d)",
+    "clock": rf"(?<!\d)(?!\d+_\d){CLOCK.format('colon3')}(?:[.,]\d+|s{SUBSECOND})?{HALF_DAY}(?!\d)",
+    "units": rf"(?<!\d)(?:(?=\d+[hm]\d)|(?=\d+s\d)){UNITS}(?![A-Za-z])",
     "decimal": rf"{SIGN}\d+[.,]\d+",
     "number": rf"{SIGN}\d+",
 }
 """A pattern for each form of a number; the first that matches counts."""
 
 MIXABLE = ({"stamp_fraction", "stamp"}, {"decimal", "number"})
-STAMPS = {"stamp_fraction", "stamp", "epoch", "clock"}
+STAMPS = {"stamp_fraction", "stamp", "epoch", "clock", "units"}
 CAMERA_WORDS = re.compile(r"(?:.*cam|.*camera|view|gopro|kinect|sensor|lens|device|c)s?")
 FRAME_WORDS = re.compile(r"(?:.*frame|frm|fr|f)s?")
 TIME_WORDS = re.compile(r"(?:.*time|.*timestamp|ts|t|sec|second|ms)s?")
@@ -89,12 +93,16 @@ class Field(NamedTuple):
         return not self.is_stamp and any(pattern.fullmatch(word) for word in self.words)
 
 
-def read_fields(names: Sequence[str]) -> list[Field]:
-    """The numbers that all names have, from the last one on, with those in folders; `/` separates folders."""
+def read_fields(names: Sequence[str], *, may_separate: bool = True) -> list[Field]:
+    """The numbers that all names have, from the last one on, with those in folders; `/` separates folders.
+
+    `may_separate`: a hyphen that all names have before a number is no minus.
+    """
     forms = list(FORMS)
     uneven = _uneven([_components(name, ["number"]) for name in names])
     while True:
         rows = [_components(name, forms) for name in names]
+        rows = _without_separators(rows) if may_separate else rows
         fields = list(_fields(rows))
         unsound = [_first_form(row[place].tokens for row in rows) for place in _uneven(rows) - uneven]
         unsound += [form for field in fields if (form := _unsound_form(field))]
@@ -108,7 +116,7 @@ def read_values(texts: Sequence[str]) -> list[Number | None]:
 
     Unlike in names, `_` may separate hours, minutes and seconds, and hours may be left out.
     """
-    fields = read_fields(texts)
+    fields = read_fields(texts, may_separate=False)
     if len(fields) == 1 and all(token.text == text for token, text in zip(fields[0].tokens, texts, strict=True)):
         return list(fields[0].values)
     clocks = [re.fullmatch(r"(?:(?:(\d+)[-_:.h])?(\d+)[-_:m])?(\d+(?:\.\d+)?)s?", text) for text in texts]
@@ -135,12 +143,35 @@ def _component(text: str, finder: re.Pattern[str]) -> Component:
     return Component((*texts, text[end:]), tuple(tokens))
 
 
+def _without_separators(rows: list[list[Component]]) -> list[list[Component]]:
+    """With hyphens in the texts before the numbers, where all after such a text have one; after `=` they are minus."""
+    after = [
+        (text, token) for row in rows for each in row for text, token in zip(each.texts, each.tokens, strict=False)
+    ]
+    signed = {text for text, token in after if not token.text.startswith("-") or text.endswith("=")}
+
+    def unsigned(component: Component) -> Component:
+        texts, tokens = list(component.texts), list(component.tokens)
+        for index, (text, token) in enumerate(zip(component.texts, component.tokens, strict=False)):
+            if text not in signed:
+                texts[index] = f"{text}-"
+                tokens[index] = Token(token.text[1:], token.form, tuple(-part for part in token.parts))
+        return Component(tuple(texts), tuple(tokens))
+
+    return [[unsigned(component) for component in row] for row in rows]
+
+
 def _parts(form: str, text: str) -> tuple[Number, ...]:
     if form in ("decimal", "number"):
         whole, _, fraction = text.replace(",", ".").partition(".")
         sign = "-" * text.startswith("-")
         return (int(whole), *([Fraction(f"{sign}0.{fraction}")] if fraction else []))
-    digits = re.sub(r"\D", "", text)
+    if form == "units":
+        found = re.fullmatch(UNITS, text)
+        assert found is not None
+        hours, minutes, seconds = (Fraction(found[unit].replace(",", ".")) if found[unit] else 0 for unit in "hms")
+        return 3600 * hours + 60 * minutes + seconds, Fraction(int(found["f"] or found["ms"] or 0), 1000)
+    digits = re.sub(r"\D", "", re.sub(r"(?<!\d)\d(?=[-_.:]\d\d[-_.:]\d\d)", r"0\g<0>", text))
     if form == "epoch":
         return (Fraction(int(digits), 10 ** (len(digits) - 10)),)
     if re.match(r"\d\d\D", text) and form != "clock":  # day, month, year

@@ -11,6 +11,7 @@ from fractions import Fraction
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
+from msdgs_train.datasets.common.hexadecimal import as_decimal
 from msdgs_train.datasets.common.name_fields import (
     CAMERA_WORDS,
     DAY,
@@ -52,7 +53,8 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
     `poses` are equal for images taken from the same place, `lenses` for those that may be of the same camera. Raises
     `NameWithoutTime`.
     """
-    everywhere = read_fields(names)
+    decimal = as_decimal(names)
+    everywhere = read_fields(decimal)
     if not everywhere and len(names) > 1:
         raise NameWithoutTime(next((name for name in names if not re.search(r"\d[^/]*$", name)), names[0]))
     fields = _dated([field for field in everywhere if len(set(field.values)) > 1])
@@ -67,6 +69,9 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
     for step in steps:
         if len(fields) > 1:
             fields = step(fields) or fields
+    if len(fields) == 1 and fields[0].is_stamp:
+        cameras = poses if len(set(poses)) < len(poses) else lenses
+        fields += _in_seconds(fields[0], everywhere, cameras)
     found = [_reading(names, field) for field in fields]
     if [reading.called for reading in found] == ["camera"]:
         if len(set(poses)) < len(poses):  # one camera, that stands still for a while
@@ -78,7 +83,7 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
 
 def times_in_order(names: Sequence[str]) -> Times:
     """The place of each file's name in their natural order; those that differ in the folder alone share a place."""
-    files = [EXTENSION.sub("", name.rsplit("/", 1)[-1]) for name in names]
+    files = [EXTENSION.sub("", name.rsplit("/", 1)[-1]) for name in as_decimal(names)]
     places = {file: place for place, file in enumerate(sorted(set(files), key=natural_order))}
     return tuple(places[file] for file in files)
 
@@ -99,6 +104,21 @@ def time_group(expression: re.Pattern[str]) -> str | int | None:
     if "time" in expression.groupindex:
         return "time"
     return 1 if expression.groups == 1 else None
+
+
+def _in_seconds(stamp: Field, fields: list[Field], cameras: Sequence[Hashable]) -> list[Field]:
+    """The number after a stamp that one camera has several times, if it tells them apart: the stamp isn't all of the
+    time then, or the number is that of another camera."""
+    moments = list(zip(cameras, stamp.values, strict=True))
+    if len(set(moments)) == len(moments):
+        return []
+    after = [field for field in fields[: _place(stamp, fields)] if field.texts == stamp.texts]
+    numbers = [field for field in after if not field.is_stamp and not field.is_called(CAMERA_WORDS)]
+    return [field for field in numbers if len(set(zip(moments, field.values, strict=True))) == len(moments)][:1]
+
+
+def _place(stamp: Field, fields: list[Field]) -> int:
+    return next(place for place, field in enumerate(fields) if field.is_stamp and field.texts == stamp.texts)
 
 
 def _dated(fields: list[Field]) -> list[Field]:

@@ -8,6 +8,7 @@ from itertools import product
 
 import pytest
 
+from msdgs_train.datasets.common.hexadecimal import as_decimal
 from msdgs_train.datasets.common.name_times import (
     NameWithoutTime,
     Reading,
@@ -61,6 +62,13 @@ ONE_CAMERA: dict[str, Callable[[int], str]] = {
     "seconds with comma": lambda i: f"t_{i / 8}".replace(".", ","),
     "halves": lambda i: f"frame_{12 + i / 2}",
     "whole and halves": lambda i: f"frame_{12 + i / 2:g}",
+    "hyphen before": lambda i: f"clip -{i:04}",
+    "hyphen in parentheses": lambda i: f"clip(-{i + 1})",
+    "hyphen first": lambda i: f"-{i}",
+    "hexadecimal": lambda i: f"cam_face/frame_{i:04x}",
+    "hexadecimal of every second": lambda i: f"frame{2 * i + 246:X}",
+    "seconds and milliseconds": lambda i: f"f_{i * 125 // 1000}s{i * 125 % 1000}ms",
+    "minutes and seconds": lambda i: f"clip_{(50 + i) // 60}m{(50 + i) % 60}s",
     "below 0": lambda i: f"t_{i - 5}",
     "decimals below 0": lambda i: f"t=-{(FRAMES - i) / 8}",
     "dots are no decimals": lambda i: f"shot010.{1 + i}",
@@ -99,6 +107,9 @@ CLOCKS = (
     "PXL_{Y}{m:02}{d:02}_{H:02}{M:02}{S:02}123",
     "signal-{Y}-{m:02}-{d:02}-{H:02}-{M:02}-{S:02}-250",
     "Screenshot {Y}-{m:02}-{d:02} at {h:02}.{M:02}.{S:02} {p}",
+    "Screenshot {Y}-{m:02}-{d:02} at {h}.{M:02}.{S:02}\u202f{p}",
+    "Screenshot {Y}-{m:02}-{d:02} at {H}.{M:02}.{S:02}",
+    "vlcsnap-{Y}-{m:02}-{d:02}-{H:02}h{M:02}m{S:02}s250",
     "{Y}{m:02}{d:02}/{Y}{m:02}{d:02}_{H:02}{M:02}{S:02}",
     "{Y}-{m:02}-{d:02}/{H:02}-{M:02}-{S:02}",
     "{Y}{m:02}{d:02}/{H:02}{M:02}{S:02}",
@@ -122,6 +133,9 @@ def test_fractions_of_seconds_count():
     names = [clock(i // 4, "IMG_{Y}{m:02}{d:02}_{H:02}{M:02}{S:02}") + f"_{i % 4 * 250:03}.jpg" for i in range(FRAMES)]
     (reading,) = read(names)
     assert since_first(reading) == [i / 4 for i in range(FRAMES)]
+    for form in ("vlcsnap-{Y}-{m:02}-{d:02}-{H:02}h{M:02}m{S:02}s", "vlcsnap-{H:02}h{M:02}m{S:02}s", "{M}m{S:02}s"):
+        names = [clock(i // 4, form, 0, 1) + f"{i % 4 * 250:03}.png" for i in range(FRAMES)]
+        assert since_first(read(names)[0]) == [i / 4 for i in range(FRAMES)]
     names = [clock(i // 4, "{H:02}-{M:02}-{S:02}", 0, 1) + f".{i % 4 * 250:03}.jpg" for i in range(FRAMES)]
     assert since_first(read(names)[0]) == [i / 4 for i in range(FRAMES)]
 
@@ -157,7 +171,6 @@ SEVERAL_CAMERAS: dict[str, Callable[[int, int], str]] = {
     "dot after the camera": lambda c, i: f"cam{c}.{i:04}",
     "clock": lambda c, i: clock(i, f"cam{c}_{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}"),
     "clock and number": lambda c, i: clock(i, f"{c}_{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}"),
-    "clock, then number": lambda c, i: clock(i, f"{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}_00{c}"),
     "letters before numbers": lambda c, i: f"C{c:04}_F{i:05}",
     "dot before the camera": lambda c, i: f"{i:06}.cam{c}",
     "constant rig": lambda c, i: f"rig1_cam{c}_time{i}_x2",
@@ -184,6 +197,8 @@ AMBIGUOUS: dict[str, Callable[[int, int], str]] = {
     "street": lambda c, i: f"image_{c:02}/{i:010}",
     "Panoptic Studio": lambda c, i: f"hdImgs/00_{c:02}/00_{c:02}_{i:08}",
     "rest of a sentence": lambda c, i: f"{i} of {c}",
+    "cameras or several in a second": lambda c, i: clock(i, f"{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}_0{c}"),
+    "the same of 3 digits": lambda c, i: clock(i, f"{{Y}}{{m:02}}{{d:02}}_{{H:02}}{{M:02}}{{S:02}}_00{c}"),
 }
 
 
@@ -261,3 +276,20 @@ def test_a_name_that_a_pattern_does_not_fit_is_named(name: str):
 def test_the_order_of_names_is_that_of_their_numbers_and_shared_by_folders():
     names = ["a/f10.png", "a/f2.png", "b/f09.jpg", "b/f2.jpg", "b/g.jpg"]
     assert [int(time) for time in times_in_order(names)] == [2, 0, 1, 0, 3]
+    assert times_in_order([f"{index:02x}.png" for index in range(40)]) == tuple(range(40))
+
+
+def test_hashes_are_no_hexadecimal_counters():
+    names = [f"{index * index * 7919 % 65536:04x}_{index:03}.png" for index in range(FRAMES)]
+    assert names == as_decimal(names)
+    assert as_decimal(["cam_1a.png", "cam_2a.png", "cam_3a.png"]) == ["cam_1a.png", "cam_2a.png", "cam_3a.png"]
+
+
+def test_several_images_in_a_second_are_ambiguous():
+    for form in (
+        "{Y}{m:02}{d:02}_{H:02}{M:02}{S:02}",
+        "{Y}-{m:02}-{d:02}/{H:02}-{M:02}-{S:02}",
+        "A_{H:02}-{M:02}-{S:02}",
+    ):
+        names = [clock(i // 4, form) + f"-{i % 4 + 1:02}.jpg" for i in range(FRAMES)]
+        assert len(read(names)) == 2
