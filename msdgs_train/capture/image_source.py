@@ -9,7 +9,7 @@ import numpy as np
 
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.pictures import Picture, fitted
-from msdgs_train.datasets.common.images import ImageHeader, composite, read_header, read_rgba
+from msdgs_train.datasets.common.images import TURNED, ImageHeader, composite, read_header, read_rgba
 from msdgs_train.datasets.common.name_fields import natural_order
 from msdgs_train.datasets.common.name_times import NameWithoutTime, readings
 from msdgs_train.datasets.common.readers import DatasetInvalid
@@ -128,7 +128,7 @@ def _unreadable(file: Path, problem: str) -> CaptureFailed:
 
 def _shown_size(file: Path) -> tuple[int, int]:
     (width, height), orientation, _ = _header(file)
-    return (height, width) if orientation >= 5 else (width, height)
+    return (height, width) if orientation in TURNED else (width, height)
 
 
 def _times(names: list[str]) -> list[float]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from msdgs_train.datasets.colmap.loader import SPARSE, load_colmap
 from msdgs_train.datasets.common.images import composite
 from msdgs_train.datasets.common.intrinsics import check_intrinsics
+from msdgs_train.datasets.common.orientations import orientation_warnings
 from msdgs_train.datasets.common.readers import DatasetInvalid
 from msdgs_train.datasets.common.scene_data import Frame, SceneData
 from msdgs_train.datasets.common.times import NAMES, timed
@@ -13,18 +14,18 @@ from msdgs_train.datasets.common.times_file import TIMES_FILE
 from msdgs_train.datasets.dnerf import TRAIN_FILE, load_dnerf
 from msdgs_train.datasets.hypernerf import DATASET_FILE, load_hypernerf
 from msdgs_train.datasets.nerfstudio import TRANSFORMS_FILE, load_nerfstudio
-from msdgs_train.datasets.neu3d import CAMERAS, load_neu3d
+from msdgs_train.datasets.neu3d import MARKERS, load_neu3d
 
 __all__ = ["DatasetInvalid", "Frame", "SceneData", "composite", "load_scene"]
 
 LAYOUTS = (
-    ("D-NeRF", TRAIN_FILE, load_dnerf),
-    ("nerfstudio", TRANSFORMS_FILE, load_nerfstudio),
-    ("HyperNeRF", DATASET_FILE, load_hypernerf),
-    ("Neu3D", CAMERAS, load_neu3d),
-    ("COLMAP", SPARSE, load_colmap),
+    ("D-NeRF", (TRAIN_FILE,), load_dnerf),
+    ("nerfstudio", (TRANSFORMS_FILE,), load_nerfstudio),
+    ("HyperNeRF", (DATASET_FILE,), load_hypernerf),
+    ("Neu3D", MARKERS, load_neu3d),
+    ("COLMAP", (SPARSE,), load_colmap),
 )
-"""Name, marker file and reader of each layout; COLMAP is tried last, since other layouts contain its files too."""
+"""Name, marker files and reader of each layout; COLMAP is tried last, since other layouts contain its files too."""
 
 
 def load_scene(
@@ -39,14 +40,16 @@ def load_scene(
     folder = Path(path)
     if not folder.is_dir():
         raise DatasetInvalid(folder, "folder", "does not exist" if not folder.exists() else "is a file")
-    for layout, marker, load in LAYOUTS:
-        if any(folder.glob(marker)):
+    for layout, markers, load in LAYOUTS:
+        if all(any(folder.glob(marker)) for marker in markers):
             has_times = load is not load_colmap or (folder / TIMES_FILE).is_file()
             own = None if has_times else NAMES  # COLMAP stores no times
             read = replace(load(folder, size), layout=layout)
             scene = timed(read, folder, own if time_from is None else time_from).in_unit_time()
-            scene = replace(scene, warnings=(*scene.warnings, *check_intrinsics(scene, folder)))
+            scene = replace(
+                scene, warnings=(*scene.warnings, *check_intrinsics(scene, folder), *orientation_warnings(scene))
+            )
             scene = scene if masks else scene.without_masks()
             return scene.split_again(llffhold) if llffhold else scene
-    markers = ", ".join(f"{name}'s has {marker}" for name, marker, _ in LAYOUTS)
-    raise DatasetInvalid(folder, "folder", f"is in no known layout: {markers}")
+    known = ", ".join(f"{name}'s has {' and '.join(markers)}" for name, markers, _ in LAYOUTS)
+    raise DatasetInvalid(folder, "folder", f"is in no known layout: {known}")

@@ -28,7 +28,7 @@ from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.fields import FieldTable
 from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
 from msdgs_train.datasets.common.extent import scene_half_size
-from msdgs_train.datasets.common.images import ImageSize, read_size
+from msdgs_train.datasets.common.images import ImageSize, other_shape, read_size
 from msdgs_train.datasets.common.readers import DatasetInvalid, JsonObject, read_json, read_table, unread_fields
 from msdgs_train.datasets.common.scene_data import Frame, SceneData, reduced
 
@@ -124,20 +124,20 @@ def _find_copy(folder: Path, id_: str, size: int | None) -> Path:
 
 
 def _frame(values: JsonObject, image_path: Path, t: float, to_scene: Transform, size: int | None) -> Frame:
-    camera = _camera(values, to_scene, read_size(image_path))
+    camera = _camera(values, to_scene, image_path)
     k1, k2, k3 = values.numbers("radial_distortion", 3).tolist()
     p1, p2 = values.numbers("tangential" if "tangential" in values.values else "tangential_distortion", 2).tolist()
     distortion = checked_distortion(Distortion(k1, k2, p1, p2, k3), camera, values.file, "radial_distortion")
     return Frame(image_path.stem, reduced(camera, size, image_path), t, image_path, distortion)
 
 
-def _camera(values: JsonObject, to_scene: Transform, image: ImageSize) -> Camera:
+def _camera(values: JsonObject, to_scene: Transform, image_path: Path) -> Camera:
     """Return the camera, in pixels of the stored image."""
     if values.number("skew") != 0:
         raise values.invalid("skew", f"must be 0, got {values.get('skew')}")
-    stated = ImageSize(*map(round, values.numbers("image_size", 2)))
+    stated, image = ImageSize(*map(round, values.numbers("image_size", 2))), read_size(image_path)
     if not stated.has_shape_of(image):
-        raise values.invalid("image_size", f"is {stated}, but the image is {image}")
+        raise values.invalid("image_size", f"is {stated}, {other_shape(stated, image_path)}")
     focal, aspect = values.number("focal_length"), values.number("pixel_aspect_ratio")
     cx, cy = values.numbers("principal_point", 2)
     pose = np.eye(4)

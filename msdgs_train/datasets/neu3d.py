@@ -27,8 +27,8 @@ from msdgs_train.datasets.common.scene_data import Frame, SceneData, reduced
 from msdgs_train.datasets.common.video import VideoFrame, read_info
 
 POSES_FILE = "poses_bounds.npy"
-CAMERAS = "cam0*"
-"""The marker of this layout, since static LLFF scenes have a `poses_bounds.npy` too."""
+MARKERS = (POSES_FILE, "cam0*")
+"""Static LLFF scenes have a `poses_bounds.npy` too, and other layouts videos beside their images."""
 
 POINTS_FILES = ("points3D_downsample*.ply", "points3d.ply", "points3D.ply")
 """The first that exists is read; of several downsampled ones the last by name, which is the smallest."""
@@ -69,6 +69,14 @@ def _rows(folder: Path, file: Path, names: list[str], count: int) -> dict[str, i
     """The row of each camera that is used, given the cameras' names in order and the number of rows."""
     left_out = {UNSYNCHRONIZED[1]} if UNSYNCHRONIZED[0] in folder.resolve().name else set()
     in_order = sorted({*names, *left_out}, key=natural_order)
+    if in_order != sorted(in_order):
+        problem = (
+            "may be in the order of the cameras' numbers or, as LLFF's script sorts them, of their names as texts, "
+        )
+        problem += (
+            f"{' '.join(sorted(in_order))}: give all names as many digits, such as cam00, in the order of the rows"
+        )
+        raise DatasetInvalid(file, "rows", problem)
     numbers = [int(name.removeprefix("cam")) for name in names]
     if count in (len(in_order), len(names)):
         found = {name: row for row, name in enumerate(in_order if count == len(in_order) else names)}

@@ -24,7 +24,7 @@ from msdgs_train.datasets.colmap import text as colmap_text
 from msdgs_train.datasets.colmap.model import ModelCamera, ModelImage
 from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
 from msdgs_train.datasets.common.extent import scene_half_size
-from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
+from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, other_shape, read_size
 from msdgs_train.datasets.common.masks import checked_mask, find_mask
 from msdgs_train.datasets.common.name_fields import natural_order
 from msdgs_train.datasets.common.paths import find_file, not_found, posix
@@ -110,7 +110,7 @@ def _frame(folder: Path, files: list[Path], image: ModelImage, camera: ModelCame
         raise DatasetInvalid(files[1], field, f"{problem}: {not_found(folder / IMAGES, image.name)}")
     stored, stated = read_size(image_path), ImageSize(camera.width, camera.height)
     if not stated.has_shape_of(stored):
-        raise DatasetInvalid(files[1], field, f"has a camera for {stated}, but the image is {stored}")
+        raise DatasetInvalid(files[1], field, f"has a camera for {stated}, {other_shape(stated, image_path)}")
     pinhole = _pinhole(files, image, camera).resized(*stored)
     distortion = Distortion(**{key: camera.values.get(key, 0.0) for key in Distortion._fields})
     distortion = checked_distortion(distortion, pinhole, files[0], f"cameras[{image.camera_id}]")

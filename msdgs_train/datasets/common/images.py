@@ -13,6 +13,8 @@ from msdgs_train.datasets.common import jpeg
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
+TURNED = range(5, 9)
+"""EXIF's orientations that exchange width and height."""
 COPY_AGAIN = "copy it again from where it came"
 CONVERT = "convert it to PNG of 8 or 16 bits, with the colors that a screen shows"
 HALF = 0.5 + 1e-9
@@ -28,10 +30,14 @@ class ImageSize(NamedTuple):
     def __str__(self) -> str:
         return f"{self.width}×{self.height}"
 
-    def has_shape_of(self, other: "ImageSize") -> bool:
-        """Whether the aspect ratios agree within 1 %, since sizes of copies are rounded to whole pixels."""
-        across, down = self.width * other.height, self.height * other.width
-        return min(*self, *other) > 0 and 100 * abs(across - down) <= down
+    def has_shape_of(self, copy: "ImageSize") -> bool:
+        """Whether a copy of an image of this size may have the other size, one side of which is rounded to pixels."""
+        if min(*self, *copy) <= 0:
+            return False
+        if self.width == copy.width or self.height == copy.height:
+            return self == copy
+        difference = abs(self.width * copy.height - self.height * copy.width)
+        return difference < max(self)
 
 
 class ImageHeader(NamedTuple):
@@ -55,6 +61,16 @@ def read_header(path: Path) -> ImageHeader:
 def read_size(path: Path) -> ImageSize:
     """Read the size in an image's header. Raises `DatasetInvalid`."""
     return read_header(path).size
+
+
+def other_shape(stated: ImageSize, path: Path) -> str:
+    """Why the image isn't one of the stated size, nor a copy of it, and what to do; the end of a message."""
+    (width, height), orientation, _ = read_header(path)
+    problem = f"but the image is {width}×{height}"
+    if orientation in TURNED and stated.has_shape_of(ImageSize(height, width)):
+        remedy = "store the images upright, as their poses are, without it"
+        return f"{problem}, which its EXIF orientation {orientation} turns: {remedy}"
+    return f"{problem}, no copy of that one: give the size that the intrinsics are for, or images that are not cut"
 
 
 def read_rgba(path: Path) -> np.ndarray:

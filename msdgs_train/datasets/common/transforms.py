@@ -14,7 +14,7 @@ import numpy as np
 
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_train.datasets.common.distortion import Distortion, checked_distortion
-from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, read_size
+from msdgs_train.datasets.common.images import EXTENSIONS, ImageSize, other_shape, read_size
 from msdgs_train.datasets.common.intrinsics import check_resolution, contradiction
 from msdgs_train.datasets.common.masks import checked_mask, dynamic_mask
 from msdgs_train.datasets.common.paths import find_file, not_found, posix
@@ -109,7 +109,7 @@ def _read_frame(entry: JsonObject, size: int | None) -> Frame:
     distortion = Distortion(*(entry.number(key, 0.0) for key in Distortion._fields))
     image_path = _named_file(entry, "file_path", EXTENSIONS)
     stored = read_size(image_path)
-    camera = reduced(_camera(entry, stored), size, image_path)
+    camera = reduced(_camera(entry, stored, image_path), size, image_path)
     t = entry.number("time") if "time" in entry.values else 0.0
     distortion = checked_distortion(distortion, camera, entry.file, f"{entry.prefix}k1")
     mask = dynamic_mask(image_path) if entry.get("mask_path") is None else _named_file(entry, "mask_path")
@@ -138,13 +138,13 @@ def _named_file(entry: JsonObject, key: str, endings: tuple[str, ...] = ()) -> P
     return found
 
 
-def _camera(entry: JsonObject, image: ImageSize) -> Camera:
+def _camera(entry: JsonObject, image: ImageSize, image_path: Path) -> Camera:
     width, height = image
     is_stated = entry.get("w") is not None or entry.get("h") is not None
     if is_stated:
         width, height = stated = ImageSize(round(entry.number("w")), round(entry.number("h")))
         if not stated.has_shape_of(image):
-            raise entry.invalid("w", f"and h are {stated}, but the image is {image}")
+            raise entry.invalid("w", f"and h are {stated}, {other_shape(stated, image_path)}")
     fx, fy = _focal_length(entry, "x", width), _focal_length(entry, "y", height)
     fx, fy = fy if fx is None else fx, fx if fy is None else fy
     if fx is None or fy is None:

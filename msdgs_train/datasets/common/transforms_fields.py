@@ -1,5 +1,6 @@
 """The fields of `transforms*.json`, as NeRF's Blender scripts, instant-ngp, nerfstudio and BlenderNeRF write them."""
 
+import re
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -18,6 +19,20 @@ LENS_NAMES = ("camera_model", "camera_type", "lens", "lens_*", "projection*", "d
 
 PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 """Lenses that are read, in any case; the others' distortion can't be undone to one pinhole image."""
+SYNONYMS = (
+    *("PERSP", "RECTILINEAR", "LINEAR", "PLANAR", "FRAME", "NONE", "UNDISTORTED", "NO_DISTORTION"),
+    *("BROWN", "BROWN_CONRADY", "PLUMB_BOB", "RADTAN", "RAD_TAN", "RADIAL_TANGENTIAL", "PINHOLE_RADTAN"),
+)
+"""Other programs' names of a pinhole and of the distortion `k1`, `k2`, `p1`, `p2`, `k3`."""
+
+OF_EXIF = ("lens_make", "lens_model", "lens_name", "lens_id", "lens_info", "lens_specification", "lens_serial*")
+"""Fields that name a product, as `lens` and `camera_model` may do."""
+OTHER_LENS = re.compile(
+    r"fish|equi|latlong|ortho|sphere|spheric|panoram|omni|kannala|stereograph|cylind|cubemap|prism|theta|rational|vr180|360"
+    r"|full_opencv|division|\bfov\b|\be?ucm\b|\bmei\b",
+    re.IGNORECASE,
+)
+"""What names of other lenses contain, also those of products."""
 
 UNDISTORT = "undistort the images first, to a pinhole camera"
 NOT_MOVING = (
@@ -78,8 +93,9 @@ def check_fields(entry: JsonObject) -> None:
         if _names_lens(key):
             if key == "camera_model" and value is not None and not isinstance(value, str):
                 raise entry.invalid(key, f"must be one of {', '.join(PINHOLES)}, got {value!r}")
-            if isinstance(value, str) and value and value.upper() not in PINHOLES:
-                raise entry.invalid(key, f"must be one of {', '.join(PINHOLES)}, got {value!r}: {UNDISTORT}")
+            if isinstance(value, str) and value and not _is_pinhole(key, value):
+                problem = f"must be one of {', '.join(PINHOLES)}, got {value!r}: {UNDISTORT}"
+                raise entry.invalid(key, f"{problem}; remove the field if it doesn't name the lens's projection")
         elif _is_on(value):
             remedy = next((text for pattern, text in REFUSED.items() if fnmatchcase(key, pattern)), None)
             if remedy is not None:
@@ -88,6 +104,15 @@ def check_fields(entry: JsonObject) -> None:
 
 def _names_lens(key: str) -> bool:
     return any(fnmatchcase(key, pattern) for pattern in LENS_NAMES)
+
+
+def _is_pinhole(key: str, value: str) -> bool:
+    """Whether a text names a pinhole, or a product, whose name says nothing else."""
+    if re.sub(r"[^A-Z0-9]+", "_", value.upper()) in (*PINHOLES, *SYNONYMS):
+        return True
+    is_product = any(fnmatchcase(key, pattern) for pattern in OF_EXIF)
+    is_product |= key in ("lens", "camera_model") and re.fullmatch("[A-Za-z_]+", value) is None
+    return is_product and OTHER_LENS.search(value) is None
 
 
 def _is_on(value: Any) -> bool:

@@ -87,7 +87,7 @@ def read_info(video: Path) -> VideoInfo:
         if first is None:
             raise _invalid(video, "has no frames")
         turn = display_turn(video, first)
-        count = stream.frames
+        count = stream.frames - sum(entry.is_discard for entry in stream.index_entries)  # by cuts without encoding
     if not count:
         with opened_video(video) as container:
             count = sum(packet.size > 0 for packet in container.demux(container.streams.video[0]))

@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from msdgs_train.datasets import DatasetInvalid, load_scene
 from msdgs_train.datasets.common.images import write_png
 from tests.train.datasets import layouts
+from tests.train.datasets.jpegs import jpeg
 from tests.train.datasets.layouts import flat
 
 Change = Callable[[Any], Any]
@@ -254,6 +256,23 @@ def other_shape(folder: Path) -> None:
     write_png(load_scene(folder).splits["train"][0].image_path, flat(0, layouts.CENTERED)[:, :200].copy())
 
 
+def resized(size: tuple[int, int], folder: Path) -> None:
+    for path in images_of(folder):
+        write_png(path, np.zeros((*size[::-1], 3), np.uint8))
+
+
+def turned_by_exif(folder: Path) -> None:
+    """JPEG files, whatever their names are."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for path in images_of(folder):
+        path.write_bytes(jpeg(np.zeros((320, 240, 3), np.uint8), exif=exif))
+
+
+def images_of(folder: Path) -> list[Path]:
+    return [frame.image_path for frames in load_scene(folder).splits.values() for frame in frames]
+
+
 def camera_model(number: int) -> Edit:
     def edit(folder: Path) -> None:
         file = folder / "sparse" / "0" / "cameras.bin"
@@ -276,7 +295,21 @@ SPOILED: list[tuple[str, Edit, str]] = [
     ("hypernerf", points([[0.0, 1.0, 2.0], [0.0, math.nan, 2.0]]), r"points\.npy: `row 1` must be finite"),
     ("hypernerf", points([[0.0, 1.0]]), r"points\.npy: `file` must hold real numbers in shape M×3"),
     ("hypernerf", remove("rgb/1x/000003.png"), r"000003\.png: `image` can't be read"),
-    ("neu3d", remove("poses_bounds.npy"), r"poses_bounds\.npy: `file` can't be read"),
+    ("neu3d", remove("poses_bounds.npy"), r"is in no known layout: .* Neu3D's has poses_bounds\.npy and cam0\*, "),
+    (
+        "nerfstudio",
+        turned_by_exif,
+        "but the image is 240×320, which its EXIF orientation 6 turns: store the images upr",
+    ),
+    ("hypernerf", turned_by_exif, "but the image is 240×320, which its EXIF orientation 6 turns: store the images upr"),
+    (
+        "colmap",
+        turned_by_exif,
+        "but the image is 240×320, which its EXIF orientation 6 turns: store the images upright",
+    ),
+    *((layout, partial(resized, (320, 241)), "320×241, no copy") for layout in ("nerfstudio", "hypernerf", "colmap")),
+    *((layout, partial(resized, (32, 25)), "32×25, no copy") for layout in ("nerfstudio", "hypernerf", "colmap")),
+    ("neu3d", partial(resized, (320, 241)), "but .*image is 320×241|320×241, but"),
     ("hypernerf", remove("metadata.json"), r"metadata\.json: `file` can't be read"),
     ("hypernerf", remove("scene.json"), r"scene\.json: `file` can't be read"),
     ("hypernerf", remove("camera/000002.json"), r"000002\.json: `file` can't be read"),

@@ -1,16 +1,19 @@
 """Images: reading, downscaling and compositing over a background."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 from PIL import Image
 
-from msdgs_train.datasets import DatasetInvalid, composite
-from msdgs_train.datasets.common.images import read_rgba, read_size, resize_area, write_png
+from msdgs_train.datasets import DatasetInvalid, composite, load_scene
+from msdgs_train.datasets.common.images import ImageSize, read_rgba, read_size, resize_area, write_png
 from tests.support.tolerances import assert_close
 from tests.train.datasets.jpegs import jpeg, ultra_hdr
+from tests.train.datasets.layouts import write_nerfstudio
+from tests.train.datasets.lens import Lens
 
 
 def image(seed: int, width: int, height: int) -> np.ndarray:
@@ -135,3 +138,26 @@ def test_of_ultra_hdr_the_image_for_usual_screens_is_read(tmp_path: Path):
     (tmp_path / "hdr.jpg").write_bytes(ultra_hdr(pixels))
     assert read_size(tmp_path / "hdr.jpg") == (64, 48)
     np.testing.assert_array_equal(read_rgba(tmp_path / "hdr.jpg"), read_rgba(tmp_path / "usual.jpg"))
+
+
+@pytest.mark.parametrize(
+    ("stated", "copies", "others"),
+    [
+        ((1920, 1080), [(1920, 1080), (192, 108), (3840, 2160), (100, 56), (100, 57)], [(1920, 1088), (192, 109)]),
+        ((1080, 1920), [(108, 192), (56, 100)], [(1080, 1919), (108, 190), (1088, 1920), (1, 1)]),
+        ((1297, 843), [(324, 210), (324, 211), (325, 211), (648, 421)], [(324, 212), (320, 210), (0, 0)]),
+    ],
+)
+def test_sizes_of_copies_are_rounded_to_pixels(stated: Any, copies: Any, others: Any):
+    assert [size for size in (*copies, *others) if ImageSize(*stated).has_shape_of(ImageSize(*size))] == copies
+
+
+@pytest.mark.parametrize(("orientation", "size", "is_told"), [(3, (32, 24), 1), (6, (32, 24), 0), (6, (24, 24), 1)])
+def test_images_that_are_shown_turned_are_told(tmp_path: Path, orientation: int, size: Any, is_told: int):
+    lens = Lens(fx=30.0, fy=30.0, cx=size[0] / 2, cy=size[1] / 2, width=size[0], height=size[1])
+    frame = load_scene(write_nerfstudio(tmp_path, lens)).splits["train"][0]
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    frame.image_path.write_bytes(jpeg(np.zeros((*size[::-1], 3), np.uint8), exif=exif))
+    told = [text for text in load_scene(tmp_path).warnings if "1 of 2 images" in text and "EXIF" in text]
+    assert len(told) == is_told

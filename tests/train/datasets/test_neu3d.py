@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
@@ -11,7 +12,15 @@ from msdgs_train.datasets.common import video
 from msdgs_train.datasets.common.images import resize_area, write_png
 from tests.support.tolerances import assert_close, tolerance
 from tests.train.datasets import layouts
-from tests.train.datasets.layouts import SMALL, points_of, poses_bounds, write_neu3d, write_neu3d_videos, write_video
+from tests.train.datasets.layouts import (
+    SMALL,
+    points_of,
+    poses_bounds,
+    write_colmap,
+    write_neu3d,
+    write_neu3d_videos,
+    write_video,
+)
 
 COUNT = 7
 
@@ -35,6 +44,43 @@ def test_names_in_capitals_and_hidden_files(tmp_path: Path):
     (videos / "cam00.mp4").rename(videos / "cam00.MP4")
     (images / "cam00" / "._0000.png").write_bytes(b"no image")
     assert [len(load_scene(folder).splits["test"]) for folder in (videos, images)] == [COUNT, 2]
+
+
+def test_cameras_whose_order_is_unclear_are_refused(tmp_path: Path):
+    write_neu3d(tmp_path, SMALL, names=tuple(f"cam{number}" for number in range(3)), count=1)
+    (tmp_path / "cam0").rename(tmp_path / "cam00")
+    (tmp_path / "cam1").rename(tmp_path / "cam10")
+    with pytest.raises(
+        DatasetInvalid, match=r"`rows` may be in the order .* as texts, cam00 cam10 cam2: give all names"
+    ):
+        load_scene(tmp_path)
+
+
+def test_videos_beside_another_layout_are_left_alone(tmp_path: Path):
+    (write_colmap(tmp_path) / "cam01.mp4").write_bytes(b"a recording")
+    assert load_scene(tmp_path).layout == "COLMAP"
+
+
+def cut_start(video: Path, count: int) -> None:
+    """Hide the first frames without encoding the others again, as `ffmpeg -ss … -c copy` does."""
+    whole = video.rename(video.with_suffix(".whole"))
+    with av.open(str(whole)) as source, av.open(str(video), "w") as cut:
+        stream = source.streams.video[0]
+        written = cut.add_stream_from_template(stream)
+        for packet in source.demux(stream):
+            if packet.pts is not None and packet.dts is not None and stream.time_base:
+                shift = round(count / 30 / stream.time_base)
+                packet.pts, packet.dts, packet.stream = packet.pts - shift, packet.dts - shift, written
+                cut.mux(packet)
+
+
+def test_frames_that_a_cut_without_encoding_hides_do_not_count(tmp_path: Path):
+    write_neu3d_videos(tmp_path)
+    for name in ("cam00.mp4", "cam01.mp4", "cam02.mp4"):
+        cut_start(tmp_path / name, 3)
+    frames = load_scene(tmp_path).splits["test"]
+    assert len(frames) == COUNT - 3
+    assert_close(frames[0].load_rgba()[..., :3].astype(float), image(0, 3).astype(float), "video_color")
 
 
 def test_splits_times_and_pixels_of_videos(tmp_path: Path):
@@ -61,16 +107,15 @@ def test_splits_times_and_pixels_of_folders(tmp_path: Path):
             assert (frame.load_rgba()[..., :3] == layouts.neu3d_color(camera, index)).all()
 
 
-def test_a_camera_may_be_left_out_and_numbers_need_no_zeros(tmp_path: Path):
-    """Rows follow the names by number: cam2 comes before cam10, and frame 2 before frame 10."""
-    write_neu3d(tmp_path, SMALL, names=("cam00", "cam2", "cam10"), count=1)
+def test_a_camera_may_be_left_out_and_numbers_of_frames_need_no_zeros(tmp_path: Path):
+    write_neu3d(tmp_path, SMALL, names=("cam00", "cam02", "cam10"), count=1)
     for index in (10, 2):
-        for camera, name in enumerate(("cam00", "cam2", "cam10")):
+        for camera, name in enumerate(("cam00", "cam02", "cam10")):
             write_png(tmp_path / name / f"{index}.png", image(camera, index))
     scene = load_scene(tmp_path)
     poses = np.load(tmp_path / "poses_bounds.npy")
     assert [frame.name for frame in scene.splits["test"]] == ["cam00_0000", "cam00_2", "cam00_10"]
-    assert [frame.name[:5] for frame in scene.splits["train"][::3]] == ["cam2_", "cam10"]
+    assert [frame.name[:5] for frame in scene.splits["train"][::3]] == ["cam02", "cam10"]
     for row, frame in zip(poses[1:], scene.splits["train"][::3], strict=True):
         assert (frame.camera.position == row[[3, 8, 13]]).all()
 

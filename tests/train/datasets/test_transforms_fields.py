@@ -82,9 +82,9 @@ APPLIED: dict[str, dict[str, Any]] = {
     **{name: {name: 0.01} for name in ("k1", "k2", "k3", "p1", "p2")},
 }
 REFUSED: dict[str, tuple[Any, ...]] = {
-    "camera_model": ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "fisheye", "FISHEYE624", "ORTHOPHOTO", "VR180_L"),
+    "camera_model": ("OPENCV_FISHEYE", "EQUIRECTANGULAR", "fisheye", "FISHEYE624", "ORTHOPHOTO", "VR180_L", "EUCM"),
     "camera_type": ("equirectangular",),
-    "lens": ("fisheye",),
+    "lens": ("fisheye", "Canon EF 8-15mm f/4L Fisheye USM"),
     "lens_mode": ("latlong",),
     "projection_type": ("ORTHO",),
     "distortion_model": ("kannala_brandt",),
@@ -176,6 +176,16 @@ def test_refused_fields_that_are_off_have_no_effect(tmp_path: Path, layout: str)
     for lens in ("PINHOLE", "opencv", "perspective", "SIMPLE_RADIAL", ""):
         assert outcome(load_scene(write(tmp_path, layout, **dict.fromkeys(lenses, lens)))) == plain
     assert outcome(load_scene(write(tmp_path, layout, lens=35.0))) == plain  # Blender's, in millimeters
+    for lens in ("PERSP", "none", "plumb_bob", "radtan", "Brown-Conrady", "linear", "Plumb Bob"):
+        assert outcome(load_scene(write(tmp_path, layout, **dict.fromkeys(lenses, lens)))) == plain
+
+
+@each_layout
+def test_names_of_products_name_no_lens(tmp_path: Path, layout: str):
+    plain = outcome(load_scene(write(tmp_path, layout)))
+    products = {"camera_model": "Canon EOS R5", "lens": "SEL35F18", "lens_make": "Apple"}
+    products["lens_model"] = "iPhone 15 Pro back camera 6.765mm f/1.78"
+    assert outcome(load_scene(write(tmp_path, layout, **products))) == plain
 
 
 @each_layout
