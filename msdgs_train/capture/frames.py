@@ -10,7 +10,7 @@ from msdgs_serve.scene import InvalidInput
 from msdgs_serve.writing import writing
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.frame_set import CapturedCamera, CapturedFrame, FrameSet
-from msdgs_train.capture.image_source import ImageSource
+from msdgs_train.capture.image_source import ImageSource, starts_by_names
 from msdgs_train.capture.pictures import Picture, Source
 from msdgs_train.capture.selection import Intervals, Moments, Selection, blurred, cuts, select
 from msdgs_train.capture.video_source import VideoSource
@@ -33,15 +33,17 @@ def extract_frames(
     """Write frames of each video, or folder of images, into `folder`, named by their number in the video.
 
     `frames` is the number that is wanted over the longest video; a video with fewer gives all. `size` is the long side
-    in pixels, which nothing is enlarged to. `offsets` are the seconds by which the videos start after the first one, 0
-    each if None. Of the first video the sharpest frame of each interval is taken, of the others those nearest in time
-    to them. `progress` is called with the numbers of frames that are read and of all.
+    in pixels, which nothing is enlarged to. `offsets` are the seconds by which the videos start after the first one; if
+    None, folders of images start as their names say, others together. Of the first video the sharpest frame of each
+    interval is taken, of the others those nearest in time to them. `progress` is called with the numbers of frames that
+    are read and of all.
 
     Each video is decoded once, with two of its frames in memory. Raises `CaptureFailed`, `InvalidInput` and
     `WriteFailed`.
     """
     check_amounts(frames, size)
     sources = [open_source(file, size) for file in inputs]
+    offsets = starts_by_names(inputs) if offsets is None else offsets
     return take_frames(sources, folder, frames=frames, offsets=offsets, progress=progress)
 
 

@@ -1,16 +1,18 @@
 """The images of a folder as frames of one camera, upright as their EXIF orientation says, and in sRGB."""
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from msdgs_train.capture.errors import CaptureFailed
 from msdgs_train.capture.pictures import Picture, fitted
 from msdgs_train.datasets.common.images import TURNED, ImageHeader, composite, read_header, read_rgba
-from msdgs_train.datasets.common.name_fields import natural_order
+from msdgs_train.datasets.common.name_fields import Number, natural_order
 from msdgs_train.datasets.common.name_times import NameWithoutTime, readings
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
@@ -19,7 +21,7 @@ ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".heic", "
 UNREAD = {".heic", ".heif", ".avif", ".dng"}
 """Of them, those that need a decoder that OpenImageIO's packages don't have."""
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".mts", ".3gp", ".gif")
-RATE = 30.0
+RATE = 30
 """Images per second, as folders of images say nothing of it."""
 
 ORIENTATIONS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
@@ -35,13 +37,20 @@ ORIENTATIONS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 
 class ImageSource:
-    """A folder of images as `Source`, in the natural order of their names; raises `CaptureFailed`."""
+    """A folder of images as `Source`, in the order of the times in their names, or else of the names; raises
+    `CaptureFailed`."""
 
     def __init__(self, folder: Path, size: int) -> None:
         self.file = folder
-        self._files = image_files(folder)
-        self._times = _times([file.name for file in self._files])
-        self.count, self.duration, self.period = len(self._files), self._times[-1], 1 / RATE
+        files = image_files(folder)
+        clock = _clock([file.name for file in files])
+        times = [Fraction(index, RATE) for index in range(len(files))] if clock is None else clock.times
+        order = sorted(range(len(files)), key=lambda index: times[index])
+        self._files = [files[index] for index in order]
+        self._times = [float(times[index] - times[order[0]]) for index in order]
+        self._is_timed = clock is not None and clock.is_true
+        self.count, self.duration = len(files), self._times[-1]
+        self.period = self.duration / (self.count - 1) if self._is_timed and self.count > 1 else 1 / RATE
         first, *others = ((file, _shown_size(file)) for file in self._files)
         for file, shown in others:
             if shown != first[1]:
@@ -62,7 +71,9 @@ class ImageSource:
             yield Picture(index, time, cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), lambda shown=pixels: shown)
 
     def notes(self) -> list[str]:
-        return [f"{self.file.name} is a folder of images, which has no times: {RATE:g} images per second are assumed"]
+        if self._is_timed:
+            return []
+        return [f"{self.file.name} is a folder of images, which has no times: {RATE} images per second are assumed"]
 
 
 def image_files(folder: Path) -> list[Path]:
@@ -131,13 +142,32 @@ def _shown_size(file: Path) -> tuple[int, int]:
     return (height, width) if orientation in TURNED else (width, height)
 
 
-def _times(names: list[str]) -> list[float]:
-    """Seconds after the first image: by the frame numbers in the names, which may leave some out, or by their order."""
+def starts_by_names(folders: Sequence[Path]) -> tuple[float, ...] | None:
+    """Seconds by which each folder begins after the first one, if the names of all have times of one kind in common."""
+    if not all(folder.is_dir() for folder in folders):
+        return None
+    clocks = [_clock([file.name for file in image_files(folder)]) for folder in folders]
+    known = [clock for clock in clocks if clock is not None]
+    firsts, lasts = [min(clock.times) for clock in known], [max(clock.times) for clock in known]
+    if len(known) < len(clocks) or len({clock.is_true for clock in known}) > 1 or max(firsts) > min(lasts):
+        return None
+    return tuple(float(first - firsts[0]) for first in firsts)
+
+
+class _Clock(NamedTuple):
+    """The times in the names of images."""
+
+    times: tuple[Number, ...]  # seconds, all different
+    is_true: bool  # or of frames, at `RATE`
+
+
+def _clock(names: list[str]) -> _Clock | None:
+    """The only times that names may have; None if there are none."""
     try:
         found = readings(names, range(len(names)), [None] * len(names))
     except NameWithoutTime:
-        found = []
-    numbers = [int(time) for time in found[0].times] if len(found) == 1 and found[0].called is None else []
-    if not numbers or sorted(set(numbers)) != numbers:
-        numbers = list(range(len(names)))
-    return [(number - numbers[0]) / RATE for number in numbers]
+        return None
+    if len(found) != 1 or found[0].called is not None or len(set(found[0].times)) < len(names):
+        return None
+    times, is_true = found[0].times, found[0].is_in_seconds
+    return _Clock(times if is_true else tuple(Fraction(time) / RATE for time in times), is_true)

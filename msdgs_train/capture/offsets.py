@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from msdgs_train.capture.image_source import starts_by_names
 from msdgs_train.capture.video_source import VideoSource, opened
 
 RATE = 8000
@@ -47,6 +48,8 @@ class Sound(NamedTuple):
 def find_offsets(videos: Sequence[Path]) -> Offsets:
     """Find when each video starts after the first one. Raises `CaptureFailed` for files that can't be read."""
     nothing = (0.0,) * len(videos)
+    if starts := starts_by_names(videos):
+        return Offsets(starts, nothing, "Starts are found by the times and numbers in the images' names.")
     if any(video.is_dir() for video in videos):
         return Offsets(nothing, nothing, "Folders of images have no sound: all are taken to start together.")
     sounds = [read_sound(video) for video in videos]

@@ -77,7 +77,8 @@ def dataset_images(folder: Path) -> list[Path]:
                 raise entry.invalid("file_path", f"names {file_path(entry)}, but there is no such file")
         files = {file for _, file in found if file is not None}
     elif (folder / SPARSE).is_dir():
-        files = {file for file in (folder / IMAGES).rglob("*") if file.suffix.lower() in ENDINGS}
+        shown = (file for file in (folder / IMAGES).rglob("*") if not file.name.startswith("."))
+        files = {file for file in shown if file.suffix.lower() in ENDINGS}
     else:
         raise InvalidInput("folder", f"a dataset with {TRANSFORMS_FILE} or {SPARSE}", folder)
     if not files:

@@ -36,7 +36,7 @@ FORMS = {
     "stamp": rf"{DATE.format('dash2')}(?:{BETWEEN}{TO_MINUTES_OR_MORE}{HALF_DAY})?(?!\d)",
     "epoch": r"(?<!\d)1\d{9}(?:\d{9}|\d{6}|\d{3})?(?!\d)(?:\.\d+|[-_]\d{9}(?!\d))?",
     "clock": rf"(?<!\d)(?!\d+_\d){CLOCK.format('colon3')}(?:[.,]\d+|s{SUBSECOND})?{HALF_DAY}(?!\d)",
-    "units": rf"(?<!\d)(?:(?=\d+[hm]\d)|(?=\d+s\d)){UNITS}(?![A-Za-z])",
+    "units": rf"(?<!\d)(?:(?=\d+[hm]\d|\d+s\d){UNITS}|\d+ms)(?![A-Za-z])",
     "decimal": rf"{SIGN}\d+[.,]\d+",
     "number": rf"{SIGN}\d+",
 }
@@ -168,7 +168,8 @@ def _parts(form: str, text: str) -> tuple[Number, ...]:
         return (int(whole), *([Fraction(f"{sign}0.{fraction}")] if fraction else []))
     if form == "units":
         found = re.fullmatch(UNITS, text)
-        assert found is not None
+        if found is None:  # milliseconds alone
+            return (Fraction(int(text.removesuffix("ms")), 1000),)
         hours, minutes, seconds = (Fraction(found[unit].replace(",", ".")) if found[unit] else 0 for unit in "hms")
         return 3600 * hours + 60 * minutes + seconds, Fraction(int(found["f"] or found["ms"] or 0), 1000)
     digits = re.sub(r"\D", "", re.sub(r"(?<!\d)\d(?=[-_.:]\d\d[-_.:]\d\d)", r"0\g<0>", text))

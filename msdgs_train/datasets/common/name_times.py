@@ -28,6 +28,7 @@ from msdgs_train.datasets.common.name_fields import (
 
 PHOTO_WORDS = re.compile(r"img|dsc[nf]?|mg|imgp|sam|dji|gopr|photo|pict?")
 """Words before the numbers that a camera gives to its photos."""
+SECOND_WORDS = re.compile(r"sec(?:ond)?s?")
 RECORDING_WORDS = re.compile(r"(?:take|clip|scene|part|chapter|video|vid|shot|seq|sequence|session|rec|g[xhls]|mvi)s?")
 """Words before the number of a recording. If it varies, frames may start again in each."""
 
@@ -41,6 +42,7 @@ class Reading(NamedTuple):
     texts: tuple[str, ...]  # the times as the names have them
     pattern: str | None  # a regular expression that finds them, if a simple one does
     called: Literal["camera", "photo"] | None  # what the words before the number say, if not a time
+    is_in_seconds: bool  # whether the names say so
 
 
 class NameWithoutTime(Exception):
@@ -203,7 +205,9 @@ def _reading(names: Sequence[str], field: Field) -> Reading:
     texts = tuple(token.text for token in field.tokens)
     pattern = field.pattern if field.pattern and _finds(field.pattern, names, texts) else None
     called = "camera" if field.is_called(CAMERA_WORDS) else "photo" if field.is_called(PHOTO_WORDS) else None
-    return Reading(times, texts, pattern, called)
+    is_decimal = any(token.form == "decimal" for token in field.tokens) and not field.is_called(FRAME_WORDS)
+    is_in_seconds = field.is_stamp or field.is_called(SECOND_WORDS) or is_decimal
+    return Reading(times, texts, pattern, called, is_in_seconds)
 
 
 def _finds(pattern: str, names: Sequence[str], texts: Sequence[str]) -> bool:

@@ -82,6 +82,7 @@ def test_colmaps_images_get_times(tmp_path: Path, clip: Path):
     write_dataset(tmp_path, [view(index) for index in TAKEN], "png")
     (tmp_path / "transforms.json").unlink()
     (tmp_path / "sparse").mkdir()
+    (tmp_path / "images" / "._00000.png").write_bytes(b"of macOS")
     assert list(times_from(clip, tmp_path).values()) == pytest.approx([TIMES[index] for index in TAKEN], abs=0.001)
 
 

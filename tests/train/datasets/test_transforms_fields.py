@@ -183,7 +183,7 @@ def test_refused_fields_that_are_off_have_no_effect(tmp_path: Path, layout: str)
 @each_layout
 def test_names_of_products_name_no_lens(tmp_path: Path, layout: str):
     plain = outcome(load_scene(write(tmp_path, layout)))
-    products = {"camera_model": "Canon EOS R5", "lens": "SEL35F18", "lens_make": "Apple"}
+    products: dict[str, Any] = {"camera_model": "Canon EOS R5", "lens": "SEL35F18", "lens_make": "Apple"}
     products["lens_model"] = "iPhone 15 Pro back camera 6.765mm f/1.78"
     assert outcome(load_scene(write(tmp_path, layout, **products))) == plain
 
