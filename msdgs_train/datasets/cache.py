@@ -38,7 +38,7 @@ class ImageCache:
 
     def mask(self, frame: Frame) -> np.ndarray | None:
         """Return which pixels of the image count, [H, W] bool; None if all do."""
-        if frame.mask_path is None:
+        if not frame.is_masked:
             return None
         return self._kept(frame, lambda: cast(np.ndarray, frame.load_mask()), is_mask=True)
 
@@ -60,6 +60,4 @@ class ImageCache:
 
 def bytes_of(frames: Iterable[Frame]) -> int:
     """What images and masks of these frames take once they are decoded."""
-    return sum(
-        frame.camera.width * frame.camera.height * (CHANNELS + (frame.mask_path is not None)) for frame in frames
-    )
+    return sum(frame.camera.width * frame.camera.height * (CHANNELS + frame.is_masked) for frame in frames)

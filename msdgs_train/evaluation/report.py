@@ -110,10 +110,10 @@ def notes(evaluation: Evaluation) -> list[str]:
         lines.append(f"best: highest PSNR on `{best.split}` during training, {best.psnr:.2f} dB.")
     elif len(evaluation.models) < len(FILES):
         lines.append(f"best: this run has no {FILES['best']}.")
-    masked = sum(frame.mask_path is not None for frame in evaluation.frames)
+    masked = sum(frame.is_masked for frame in evaluation.frames)
     if masked:
-        line = f"masks: {masked} of {len(evaluation.frames)} images have one; scores are over the pixels that count, "
-        lines.append(line + "LPIPS and ꟻLIP over all, without an error in the others.")
+        line = f"masks: {masked} of {len(evaluation.frames)} images have pixels that don't count; "
+        lines.append(line + "scores are over the others, LPIPS and ꟻLIP over all, without an error in those.")
     return [*lines, *(f"{HEADINGS[name][:-2]}: unavailable, {why}." for name, why in evaluation.unavailable.items())]
 
 

@@ -18,7 +18,7 @@ class Image(Protocol):
     """What is read of a `Frame`."""
 
     def load_rgba(self) -> np.ndarray: ...
-    def load_mask(self) -> np.ndarray | None: ...
+    def load_own_mask(self) -> np.ndarray | None: ...
 
 
 def find_backdrop(frames: Sequence[Image]) -> Color | None:
@@ -31,7 +31,7 @@ def find_backdrop(frames: Sequence[Image]) -> Color | None:
             return None
         is_border = np.full(rgba.shape[:2], True)
         is_border[1:-1, 1:-1] = False
-        mask = frames[index].load_mask()
+        mask = frames[index].load_own_mask()
         shown.append(rgba[is_border if mask is None else is_border & mask, :3])
         pixels += np.count_nonzero(is_border)
     colors = np.concatenate(shown).astype(float)

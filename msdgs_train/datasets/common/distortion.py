@@ -1,5 +1,6 @@
 """Lens distortion by the Brown–Conrady model, coefficients as in OpenCV, COLMAP and nerfstudio, and its removal."""
 
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +11,8 @@ from msdgs_serve.scene import Camera
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 FOLD_GRID = 33
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy, pixels."""
 
 
 class Distortion(NamedTuple):
@@ -45,11 +48,39 @@ def undistort(rgba: np.ndarray, camera: Camera, distortion: Distortion) -> np.nd
     """Resample an image to the pinhole `camera`: uint8 [H, W, 4], straight alpha, like `rgba`.
 
     `camera` has the intrinsics of the distorted image and its size, H×W. Pixels are interpolated bilinearly,
-    colors weighted by alpha. Points outside of the image take the nearest pixel of its border.
+    colors weighted by alpha. Points outside of the image, which `inside` tells, take the nearest pixel of its border.
     """
     result = np.empty_like(rgba)
     _resample(np.ascontiguousarray(rgba), (camera.fx, camera.fy, camera.cx, camera.cy), distortion, result)
     return result
+
+
+def shows_outside(camera: Camera, distortion: Distortion) -> bool:
+    """Whether pixels of the pinhole image lie outside of the distorted one. Those at its border do first."""
+    return _shows_outside((camera.fx, camera.fy, camera.cx, camera.cy), camera.width, camera.height, distortion)
+
+
+@lru_cache(maxsize=1 << 14)
+def _shows_outside(intrinsics: Intrinsics, width: int, height: int, distortion: Distortion) -> bool:
+    columns, rows = np.arange(width), np.arange(height)
+    sides = (columns, 0), (columns, height - 1), (0, rows), (width - 1, rows)
+    return not all(_is_inside(intrinsics, width, height, distortion, *side).all() for side in sides)
+
+
+def inside(camera: Camera, distortion: Distortion) -> np.ndarray:
+    """Which pixels of the pinhole image have their centers in the distorted image: bool [H, W]."""
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    rows, columns = np.arange(camera.height)[:, None], np.arange(camera.width)
+    return _is_inside(intrinsics, camera.width, camera.height, distortion, columns, rows)
+
+
+def _is_inside(
+    intrinsics: Intrinsics, width: int, height: int, distortion: Distortion, columns: Any, rows: Any
+) -> np.ndarray:
+    fx, fy, cx, cy = intrinsics
+    u, v = distorted((columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, distortion)
+    x, y = fx * u + cx, fy * v + cy
+    return (x >= 0) & (x <= width) & (y >= 0) & (y <= height)
 
 
 def distorted(x: Any, y: Any, distortion: Distortion) -> tuple[Any, Any]:

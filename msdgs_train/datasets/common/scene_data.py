@@ -10,7 +10,7 @@ import numpy as np
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.similarity import IDENTITY, Similarity
 from msdgs_train.datasets.common.backdrop import Color, find_backdrop
-from msdgs_train.datasets.common.distortion import Distortion, undistort
+from msdgs_train.datasets.common.distortion import Distortion, inside, shows_outside, undistort
 from msdgs_train.datasets.common.extent import scene_half_size
 from msdgs_train.datasets.common.images import read_rgba, resize_area
 from msdgs_train.datasets.common.masks import WHITE, as_rgba, read_mask
@@ -64,11 +64,29 @@ class Frame:
         """
         return self._as_camera(read_rgba(self.image_path))
 
+    @property
+    def is_masked(self) -> bool:
+        """Whether some pixels don't count, by a mask or since the stored image doesn't show them."""
+        return self.mask_path is not None or self._shows_outside
+
+    @property
+    def _shows_outside(self) -> bool:
+        return self.distortion is not None and shows_outside(self.camera, self.distortion)
+
     def load_mask(self) -> np.ndarray | None:
         """Read [height, width] bool, true where the pixels of `load_rgba` count; None if all do.
 
-        A pixel counts if all of the stored pixels that it was made of do. Raises `DatasetInvalid`, also if none does.
+        A pixel counts if all of the stored pixels that it was made of do, and if its center, distorted, is in the
+        stored image. Raises `DatasetInvalid`, also if none does.
         """
+        mask = self.load_own_mask()
+        if self.distortion is None or not self._shows_outside:
+            return mask
+        shown = inside(self.camera, self.distortion)
+        return shown if mask is None else shown & mask
+
+    def load_own_mask(self) -> np.ndarray | None:
+        """`load_mask` by the mask's file alone."""
         if self.mask_path is None:
             return None
         mask = self._as_camera(as_rgba(read_mask(self.mask_path)))[..., 0] == WHITE

@@ -207,3 +207,34 @@ def test_instant_ngps_masks_are_white_where_pixels_do_not_count(tmp_path: Path, 
     masks = {frame.image_path.name: frame.load_mask() for frame in frames}
     assert masks["f_00.png"] is None
     assert (masks["f_01.png"] == (mask[..., 0] == 0)).all()
+
+
+@pytest.mark.parametrize("size", [None, 160])
+def test_pixels_that_the_stored_image_does_not_show_do_not_count(tmp_path: Path, size: int | None):
+    lens = LENSES["pincushion"]
+    frame = load_scene(layouts.write_nerfstudio(tmp_path, lens), size, masks=False).splits["train"][0]
+    mask, camera, cache = frame.load_mask(), frame.camera, ImageCache()
+    assert mask is not None
+    for row, column in np.argwhere(np.ones_like(mask))[::13]:
+        u, v = lens.pixel((column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0)
+        assert mask[row, column] == (0 <= u <= lens.width and 0 <= v <= lens.height)
+    assert (cache.mask(frame) == mask).all()
+    half = cache.half_mask(frame)
+    assert half is not None
+    assert 0.8 < half.mean() <= mask.mean() < 1
+
+
+def test_a_mask_and_the_border_of_the_image_both_count(tmp_path: Path):
+    mask = flat(255, LENS)
+    mask[:60] = 0
+    frame = frame_with(tmp_path, mask, LENSES["pincushion"])
+    own, border = frame.load_own_mask(), load_scene(tmp_path, masks=False).splits["train"][0].load_mask()
+    assert own is not None
+    assert border is not None
+    assert (frame.load_mask() == (own & border)).all()
+
+
+def test_images_that_show_all_have_no_mask(tmp_path: Path):
+    frame = load_scene(layouts.write_nerfstudio(tmp_path, LENSES["barrel"])).splits["train"][0]
+    assert frame.load_mask() is None
+    assert ImageCache().mask(frame) is None

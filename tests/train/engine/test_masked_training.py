@@ -192,7 +192,9 @@ def test_a_run_and_its_evaluation_say_that_there_are_masks(tmp_path: Path):
         assert cli.main(["fit", data, str(run), "--steps=8", *FEW, *options]) == 0
         assert cli.main(["eval", str(run)]) == 0
         table = (run / "eval" / "test.md").read_text()
-        assert ("masks: 1 of 1 images have one; scores are over the pixels that count" in table) == (name == "masked")
+        assert ("masks: 1 of 1 images have pixels that don't count; scores are over the others" in table) == (
+            name == "masked"
+        )
         scored, logged = (json.loads((run / file).read_text()) for file in ("eval/test.json", "metrics.json"))
         assert scored["models"]["last"]["mean"]["psnr"] == logged["splits"]["test"]["psnr"]
         psnrs.append(logged["splits"]["test"]["psnr"])
