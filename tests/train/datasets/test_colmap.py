@@ -74,13 +74,6 @@ def test_invalid_poses_are_refused(tmp_path: Path, ending: str, pose: tuple[floa
         load_scene(folder)
 
 
-def test_intrinsics_of_larger_images_are_refused(tmp_path: Path):
-    folder = write_colmap(tmp_path, ending="txt")
-    (folder / "sparse" / "0" / "cameras.txt").write_text("7 PINHOLE 320 240 600 600 320 240\n")
-    with pytest.raises(DatasetInvalid, match=r"`principal points` .* the center of images 2 times as wide"):
-        load_scene(folder)
-
-
 NAMES = tuple(f"v_{index}.png" for index in range(5))
 
 

@@ -173,11 +173,10 @@ def test_each_field_has_an_example():
 
 
 @pytest.mark.parametrize("ending", ["bin", "txt"])
-def test_a_principal_point_outside_of_colmaps_images_is_told(
+def test_principal_points_outside_of_colmaps_images_are_refused(
     tmp_path: Path, ending: str, monkeypatch: pytest.MonkeyPatch
 ):
     outside = COLMAP_LENSES["PINHOLE"]._replace(cx=640.0, cy=480.0)
     monkeypatch.setitem(COLMAP_LENSES, "PINHOLE", outside)
-    (warning,) = load_scene(write_colmap(tmp_path, outside, ending=ending)).warnings
-    assert "the principal point of 3 of 3 images lies outside of them" in warning
-    assert warning.endswith("it is the center of images 4 times as wide")
+    with pytest.raises(DatasetInvalid, match=r"`principal points` .* the center of images 4 times as wide"):
+        load_scene(write_colmap(tmp_path, outside, ending=ending))
