@@ -93,7 +93,7 @@ def read_pixels(path: Path, dtype: str) -> np.ndarray:
     if pixels is None:
         raise _unreadable(path, f"{problem.splitlines()[0] if problem else 'no pixels'}: {COPY_AGAIN}")
     if is_jpeg and not jpeg.is_whole(path.read_bytes()):
-        raise DatasetInvalid(path, "image", f"is cut off: {COPY_AGAIN}")
+        raise DatasetInvalid(path, "image", f"is cut off: {COPY_AGAIN}, or store it anew if nothing is missing")
     return pixels
 
 

@@ -77,10 +77,10 @@ def test_file_names_with_and_without_extension(tmp_path: Path, file_path: str, f
 
 
 def test_intrinsics_of_a_frame_come_before_those_of_the_file_and_these_before_the_angle(tmp_path: Path):
-    camera = camera_with(tmp_path, {"fl_x": 41.0}, fl_x=31.0, fl_y=32.0, cx=9.0, cy=4.5, w=320, h=240)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 32.0, 9.0, 4.5)
-    camera = camera_with(tmp_path, {}, fl_x=31.0, cx=9.0)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (31.0, 31.0, 9.0, 120.0)
+    camera = camera_with(tmp_path, {"fl_x": 41.0}, fl_x=31.0, fl_y=32.0, cx=150.0, cy=114.5, w=320, h=240)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (41.0, 32.0, 150.0, 114.5)
+    camera = camera_with(tmp_path, {}, fl_x=31.0, cx=150.0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (31.0, 31.0, 150.0, 120.0)
 
 
 def test_float_images_are_refused(tmp_path: Path):
