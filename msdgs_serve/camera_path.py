@@ -14,7 +14,7 @@ from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE, orbit
 from msdgs_serve.scene.fields import FieldTable
 
 DEFAULT_FPS = 24.0
-MAX_RADIANS = 3.15
+MAX_RADIANS = 3.15  # of fields of view: if all are below, they may not be in degrees
 MIN_FPS, MAX_FPS = 0.01, 240.0
 MAX_NUMBER = 1e9
 """Limit of all numbers in a path, within which single precision neither overflows nor underflows."""

@@ -80,18 +80,18 @@ def test_a_3d_filter_of_any_width_gives_gaussians_or_drops_them(tmp_path: Path, 
         np.testing.assert_allclose(found.gaussians.scales[0], some_gaussians(COUNT).scales[0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["<f4", "u1", "<u2"])
+@pytest.mark.parametrize("kind", ["<f4", "u1", "<u2", "<i4"])
 def test_colors_stand_for_sh_of_degree_0_if_there_is_none(tmp_path: Path, kind: str):
     stored = columns(0)
     colors = RNG.integers(0, 256, (3, COUNT))
     plain = {name: values for name, values in stored.items() if not name.startswith("f_dc")}
-    largest = 255 if kind == "u1" else 65535
+    largest = 65535 if kind == "<u2" else 255
     types = {name: kind if name in ("red", "green", "blue") else "<f4" for name in [*plain, "red", "green", "blue"]}
     rows = np.empty(COUNT, list(types.items()))
     scaled = colors / 255 if kind == "<f4" else np.round(colors / 255 * largest)
     for name, values in (plain | dict(zip(("red", "green", "blue"), scaled, strict=True))).items():
         rows[name] = values
-    ply = {"<f4": "float", "u1": "uchar", "<u2": "ushort"}
+    ply = {"<f4": "float", "u1": "uchar", "<u2": "ushort", "<i4": "int"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {COUNT}"]
     lines += [f"property {ply[kind]} {name}" for name, kind in types.items()]
     (tmp_path / "a.ply").write_bytes("\n".join([*lines, "end_header", ""]).encode() + rows.tobytes())

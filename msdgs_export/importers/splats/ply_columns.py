@@ -9,6 +9,7 @@ import numpy as np
 from msdgs_export.importers.errors import ImportFailed
 from msdgs_serve.scene.spherical_harmonics import SH_DEGREES
 from msdgs_train.datasets.common.ply_file import PlyFile, PlyInvalid
+from msdgs_train.datasets.common.ply_points import white_of
 
 PREFIX = re.compile(r"(scalar_)+", re.IGNORECASE)
 """CloudCompare's, before the names of all properties but positions, normals and colors."""
@@ -66,11 +67,11 @@ class Columns:
         return column.astype(np.uint32)
 
     def fraction(self, name: str) -> np.ndarray:
-        """A column as float64; integers are divided by the largest of their type. Raises `ImportFailed` for floats that
-        are numbers of bytes."""
+        """A column as float64; integers are divided by the largest of their type, of 32 bits by that of the first type
+        that holds them. Raises `ImportFailed` for floats that are numbers of bytes."""
         kind, values = self._column(name).dtype, self.read(name)
         if kind.kind != "f":
-            return values / np.iinfo(kind).max
+            return values / (white_of(values) if kind.itemsize == 4 else np.iinfo(kind).max)
         if (values > MAX_FRACTION).any():
             raise ImportFailed(self._file, f"`{name}` is up to {values.max():g}; as float, colors are from 0 to 1")
         return values

@@ -187,7 +187,7 @@ def _opened(path: Path) -> "oiio.ImageInput":
     """A reader of the file, of Ultra HDR that of its image for usual screens."""
     try:
         with path.open("rb") as file:
-            has_gain_map = jpeg.has_gain_map(file.read(jpeg.HEAD))
+            has_gain_map = jpeg.has_gain_map(file)
     except OSError as error:
         raise _unreadable(path, str(error.strerror)) from None
     straight = oiio.ImageSpec()

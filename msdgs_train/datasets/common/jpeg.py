@@ -1,6 +1,7 @@
 """What OpenImageIO doesn't tell of a JPEG: that it is cut off, and its image for usual screens beside one in HDR."""
 
 import re
+from typing import BinaryIO
 
 START = b"\xff\xd8"
 MARKER = re.compile(rb"\xff([^\x00\xd0-\xd7\xff])", re.DOTALL)
@@ -23,9 +24,9 @@ def is_whole(content: bytes) -> bool:
     return False
 
 
-def has_gain_map(head: bytes) -> bool:
-    """Whether a file that begins so is in Ultra HDR."""
-    return head.startswith(START) and GAIN_MAP in head
+def has_gain_map(file: BinaryIO) -> bool:
+    """Whether a file, at its beginning, is in Ultra HDR."""
+    return file.read(len(START)) == START and GAIN_MAP in file.read(HEAD)
 
 
 def without_gain_map(content: bytes) -> bytes:

@@ -31,6 +31,11 @@ def read_ply_points(file: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
     return (points, _colors(file, vertices)) if len(points) else (None, None)
 
 
+def white_of(colors: np.ndarray) -> int:
+    """The first of `WHITES` that no color is above."""
+    return next((white for white in WHITES if colors.max(initial=0) <= white), WHITES[-1])
+
+
 def _columns(vertices: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
     return np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
 
@@ -41,7 +46,7 @@ def _colors(file: Path, vertices: np.ndarray) -> np.ndarray | None:
         return None
     colors = _columns(vertices, COLOR)
     if any(kinds[name].kind in "iu" for name in COLOR):
-        colors /= next(white for white in WHITES if colors.max() <= white)
+        colors /= white_of(colors)
     if not ((colors >= 0) & (colors <= 1)).all():
         raise DatasetInvalid(file, "property red", "green and blue must be in [0, 1], or integers of 0 and more")
     return colors

@@ -227,6 +227,10 @@ BAD_PLY = [
     (lambda content: content.replace(b"0.25", b"nan"), r"`vertex\[1\]` must be finite"),
     (lambda content: content.replace(b"0.25", b"0,25"), "`file` has a row of `vertex` that isn't 6 numbers"),
     (lambda content: content.replace(b" 51", b" -51"), "`file` has a number that `blue` of `vertex` can't hold"),
+    (
+        lambda content: content.replace(b"uchar red", b"float red").replace(b"255 0", b"nan 0"),
+        "`property red` green and",
+    ),
 ]
 
 
