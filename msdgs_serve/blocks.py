@@ -1,6 +1,5 @@
 """Frames in blocks by scene and time, which are drawn by this process or by workers on other machines."""
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -74,8 +73,7 @@ def draw_block(
     _, last = session.scene.metadata.time_range
     for number, camera, t in block.frames:
         if dt is not None:
-            left = math.nextafter(last - t, 0.0)  # rounded down, so that t + left isn't after the last time
-            options = replace(options, motion_dt=min(dt, left))
+            options = replace(options, motion_dt=min(dt, last - t))
         image = renderer.render(session, camera, t, options)
         yield number, encode(image, look.image_format, look.quality, channels)
 

@@ -20,6 +20,7 @@ from msdgs_serve.scene.scene_file import CHUNK, SceneFile, read_scene_file
 from msdgs_serve.threads import run_parallel, sharing_cores, thread_count
 
 _MAX_DETAILS = 500
+ROUNDING = 1e-9  # of a sum of times beyond an end, as a fraction of the time range
 
 
 class DeformationSession:
@@ -71,6 +72,12 @@ class DeformationSession:
         if not t0 <= t <= t1:
             expected = f"in the scene's range [{t0}, {t1}]"
             raise InvalidInput(field, expected if field == "t" else f"such that t + {field} is {expected}", t)
+
+    def later(self, t: float, by: float) -> float:
+        """Return `t + by`; an end of the scene's range if it is beyond by rounding alone."""
+        t0, t1 = self.scene.metadata.time_range
+        end = min(max(t + by, t0), t1)
+        return end if abs(t + by - end) <= ROUNDING * (t1 - t0) else t + by
 
     def check_steps(self, steps: float | None) -> None:
         """Raise `InvalidInput` if the scene can't be posed after `steps` layers."""

@@ -38,7 +38,7 @@ PROGRAM = "msdgs-render"
 RECORD = "msdgs-render.json"
 DEFAULT_FRAMES, DEFAULT_ELEVATION = 60, 20.0
 """Of a turn around the scene; the elevation in degrees."""
-OPTIONS = ("elevation", "width", "height", "region", "fps", "quality")
+OPTIONS = ("elevation", "width", "height", "region", "fps", "quality", "dt")
 """Those whose values are checked where they are used, by these names."""
 
 DESCRIPTION = """\
@@ -73,6 +73,8 @@ def _by_option(error: MsdgsError | OSError, options: argparse.Namespace) -> Msdg
         name = error.field.removeprefix("camera.")
         if name in OPTIONS and getattr(options, name) is not None:
             return error.renamed(f"--{name}")
+        if name == "background" and options.transparent:
+            return InvalidInput("--transparent", f"left out for {options.format}, which has no alpha", "given")
     return error
 
 
@@ -129,13 +131,13 @@ def _run(options: argparse.Namespace) -> None:
             raise InvalidInput("OUT", expected, options.out.name)
         require_pyav(cast(VideoFormat, video))
     _refuse(options, ["format", "quality"] if is_video else ["fps"], "for images" if is_video else "for a video")
-    views, fps = _views(options)
     image_format = cast(ImageFormat, options.format or "png")
-    transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
     if options.dt is not None and (is_video or not FORMATS[image_format].holds_float):
         raise InvalidInput("--dt", "left out, as only exr and npy hold motion vectors", options.dt)
     if options.dt is not None and not 0 < options.dt < math.inf:
         raise InvalidInput("--dt", "above 0", options.dt)
+    views, fps = _views(options)
+    transparent = options.transparent or (FORMATS[image_format].holds_float and not is_video)
     region = None if options.region is None else Region(*options.region)
     if region:
         for view in views:
@@ -173,12 +175,17 @@ def _views(options: argparse.Namespace) -> tuple[list[View], float]:
     """Return all frames, and the frames per second of a video."""
     if (options.width is None) != (options.height is None):
         raise InvalidInput("--width", "given together with --height", "only one of them")
-    if options.scene.suffix == ".json" or options.path is not None:
+    if _is_path(options.scene) or options.path is not None:
         _refuse(options, ["frames", "elevation"], "for a turn around the scene, not for a camera path")
-    if options.scene.suffix == ".json":
+    if _is_path(options.scene):
         return _views_of_scenes(options)
     path = _path(options, _opened(options.scene, options))
     return [View(options.scene, camera, t) for camera, t in path.frames], path.fps
+
+
+def _is_path(file: Path) -> bool:
+    """Whether the first argument is a camera path."""
+    return file.suffix.lower() == ".json"
 
 
 def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
@@ -194,9 +201,11 @@ def _views_of_scenes(options: argparse.Namespace) -> tuple[list[View], float]:
 
 def _opened(scene: Path, options: argparse.Namespace) -> DeformationSession:
     """Open a scene, and check that it has motion if that is to be drawn."""
+    if not scene.is_file():
+        raise InvalidInput("SCENE", "a scene file (.onnx) or a camera path (.json)", f"{scene}, which is none")
     session = DeformationSession(scene)
     if options.dt is not None:
-        check_times(session, session.scene.metadata.time_range[0], motion_dt=0.0)
+        check_times(session, session.scene.metadata.time_range[0], motion_dt=options.dt)
     return session
 
 
@@ -302,11 +311,11 @@ def _claim(folder: Path, record: str) -> None:
     file = folder / RECORD
     if file.exists():
         if file.read_text(encoding="utf-8", errors="replace") != record:
-            expected = "an empty folder, or one with frames of the same scenes, path and format"
-            raise InvalidInput("out", expected, f"{folder}, with frames of another command")
+            expected = "a folder without frames of another command: delete them, or repeat that command"
+            raise InvalidInput("OUT", expected, folder)
         return
     if any(not each.name.startswith(".") for each in folder.iterdir()):
-        raise InvalidInput("out", "an empty folder, or one of an earlier run of this command", folder)
+        raise InvalidInput("OUT", "an empty folder, or one of an earlier run of this command", folder)
     write_text(file, record)
 
 

@@ -1,5 +1,6 @@
 """Render a scene at a time, with a camera, to an image. Independent of HTTP."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -52,6 +53,26 @@ class RenderOptions:
     steps: float | None = None  # number of the scene's layers to apply; None: all
     region: Region | None = None  # the part of the camera's image that is drawn; None: all of it
     rasterizer: RasterizerOptions = GSPLAT
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.background, str):
+            object.__setattr__(self, "background", _color(self.background))
+        elif self.background not in ("scene", "transparent"):
+            raise InvalidInput("background", "scene, transparent, or a color of three numbers", self.background)
+        for name, kind in (("shutter", Shutter), ("region", Region)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise InvalidInput(name, f"a {kind.__name__}", repr(value))
+
+
+def _color(values: Sequence[float]) -> Color:
+    try:
+        red, green, blue = (float(value) for value in values)
+    except (TypeError, ValueError):
+        raise InvalidInput("background", "scene, transparent, or a color of three numbers", repr(values)) from None
+    if not all(0 <= value <= 1 for value in (red, green, blue)):
+        raise InvalidInput("background", "a color in [0, 1]", (red, green, blue))
+    return red, green, blue
 
 
 DEFAULT_OPTIONS = RenderOptions()
@@ -109,7 +130,7 @@ class Renderer:
     ) -> Image:
         gaussians, later = self.posed(session, time, job, options.steps), None
         if options.motion_dt is not None:
-            later = self.posed(session, time + options.motion_dt, job, options.steps)
+            later = self.posed(session, session.later(time, options.motion_dt), job, options.steps)
         with job.stage("draw"), session.as_scene_file_error(time):
             background = resolve_background(session, options.background)
             constants = as_trained(session.scene.metadata, options.rasterizer)
@@ -136,7 +157,9 @@ class Renderer:
             motion = None if extra is None else drawn.extra / np.where(drawn.alpha > 0, drawn.alpha, 1)[..., None]
             counts = drawn.counts if options.counts else None
             depth = in_world_units(drawn.depth, place.scale) if options.depth else None
-            return Image(drawn.rgb, drawn.alpha, depth, transparent, camera, t, motion, counts, options.region)
+            return Image(
+                drawn.rgb, drawn.alpha, depth, transparent, camera, t, motion, options.motion_dt, counts, options.region
+            )
 
 
 def in_world_units(depth: np.ndarray, scale: float) -> np.ndarray:
@@ -164,10 +187,10 @@ def check_times(
         raise InvalidInput("dt", "left out: this scene switches from frame to frame, nothing moves", motion_dt)
     session.check_time(t)
     if motion_dt is not None:
-        session.check_time(t + motion_dt, "dt")
+        session.check_time(session.later(t, motion_dt), "dt")
     if shutter is not None:
-        session.check_time(t + shutter.open, "shutter.open")
-        session.check_time(t + shutter.close, "shutter.close")
+        session.check_time(session.later(t, shutter.open), "shutter.open")
+        session.check_time(session.later(t, shutter.close), "shutter.close")
 
 
 def resolve_background(session: DeformationSession, background: Background) -> Color:

@@ -388,13 +388,17 @@ def _exists(name: str) -> SceneExists:
 
 def _checked(path: Path) -> Path:
     if path.is_dir():
+        for file in path.iterdir():
+            if file.suffix != SUFFIX and file.suffix.lower() == SUFFIX:
+                logger.warning("%s is not served, as its name doesn't end with %s in small letters", file, SUFFIX)
         return path
     if not path.is_file():
         raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}, which does not exist")
     if path.suffix != SUFFIX:
         with path.open("rb") as file:
             other = foreign_file(file.read(START_BYTES), str(path))
-        hint = f", which {other}" if other else ""
+        in_capitals = ", not in small letters" if path.suffix.lower() == SUFFIX else ""
+        hint = f", which {other}" if other else in_capitals
         raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}{hint}")
     if not is_servable_name(path.stem):
         raise InvalidInput("paths", "files with printable, unhidden names", repr(path.name))

@@ -35,7 +35,7 @@ def thread_count() -> int:
     Raises `InvalidInput` naming the variable.
     """
     setting = os.environ.get(THREADS_VARIABLE)
-    if setting is None:
+    if not setting:
         return _cores()
     if not setting.isdecimal() or int(setting) < 1:
         raise InvalidInput(THREADS_VARIABLE, "a whole number above 0", repr(setting))

@@ -49,9 +49,10 @@ VIDEO_FORMATS: dict[VideoFormat, VideoTraits] = {
 BT709 = 1  # as colorspace, primaries and transfer function alike
 LIMITED_RANGE = 1
 
-# fragmented mp4 can be played while it is received; animated WebP loops forever
+# fragmented mp4 can be played while it is received; its header waits for the first fragment, by which it knows that the
+# times of frames, which x264 reorders, begin at 0; animated WebP loops forever
 MUXER_OPTIONS: dict[VideoFormat, dict[str, str]] = {
-    "mp4": {"movflags": "frag_keyframe+empty_moov+default_base_moof"},
+    "mp4": {"movflags": "frag_keyframe+delay_moov+default_base_moof"},
     "webm": {},
     "webp": {"loop": "0"},
 }

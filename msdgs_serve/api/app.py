@@ -23,12 +23,12 @@ from msdgs_serve.store import SceneStore
 
 DESCRIPTION = """Frames of dynamic Gaussian scenes, for any camera and any time.
 
-Cameras have OpenCV axes: x right, y down, z forward. Angles are degrees. Every error is
+Cameras have OpenCV axes: x right, y down, z forward. Angles are degrees. Every error, but of browsers' preflights, is
 `application/problem+json` (RFC 9457) and names the invalid fields. Every response has an `X-Request-ID`, which is the
 client's own if it sends a valid one."""
 
 STREAMED = (("POST", "/scenes"),)
-FRAME_HEADERS = ("Msdgs-Scene", "Msdgs-Plan", "Msdgs-Error", "Msdgs-Channels")
+FRAME_HEADERS = ("Msdgs-Scene", "Msdgs-Plan", "Msdgs-Error", "Msdgs-Channels", "Msdgs-Warning")
 EXPOSED_HEADERS = (REQUEST_ID, "ETag", "Server-Timing", *FRAME_HEADERS, "Retry-After")
 
 

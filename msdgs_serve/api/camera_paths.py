@@ -2,18 +2,24 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, BeforeValidator, Field
 
 from msdgs_serve.api.numbers import FieldOfView, FramesPerSecond, Number, Pixels, Unit
 
 MAX_TIMES = 1000
 
 
-class PathCamera(BaseModel):
-    """A camera of nerfstudio's camera_path.json, in OpenGL axes; other keys are ignored."""
+def _joined(value: Any) -> Any:
+    """The numbers of four rows."""
+    is_nested = isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value)
+    return [number for row in value for number in row] if is_nested else value
 
-    camera_to_world: Annotated[list[Number], Field(min_length=16, max_length=16)] = Field(
-        description="4×4 by rows", examples=[[0, 0, 1, 4, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]]
+
+class PathCamera(BaseModel, extra="allow"):
+    """A camera of nerfstudio's camera_path.json, in OpenGL axes; other keys are named in the header Msdgs-Warning."""
+
+    camera_to_world: Annotated[list[Number], BeforeValidator(_joined), Field(min_length=16, max_length=16)] = Field(
+        description="4×4 by rows, or as four rows", examples=[[0, 0, 1, 4, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]]
     )
     fov: FieldOfView = Field(description="vertical, degrees")
     camera_type: Literal["perspective"] | None = Field(default=None, description="no other can be drawn")
@@ -21,8 +27,8 @@ class PathCamera(BaseModel):
     render_time: Unit | None = Field(default=None, description="fraction of the time range; default: evenly spaced")
 
 
-class NerfstudioPath(BaseModel):
-    """The contents of nerfstudio's camera_path.json; other keys are ignored."""
+class NerfstudioPath(BaseModel, extra="allow"):
+    """The contents of nerfstudio's camera_path.json; the header Msdgs-Warning names keys that nothing reads."""
 
     camera_path: Annotated[list[PathCamera], Field(max_length=MAX_TIMES)] = Field(description="one or more")
     camera_type: Literal["perspective"] = Field(default="perspective", description="no other can be drawn")

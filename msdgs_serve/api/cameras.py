@@ -18,7 +18,7 @@ def resolve_camera(request: RenderRequest, served: ServedScene) -> Camera:
     spec = request.camera
     if isinstance(spec, SceneCamera):
         camera = _pick(spec, served.metadata.cameras).camera
-        return camera.resized(*_size(request, camera.width, camera.height))
+        return camera.of_size(*_size(request, camera.width, camera.height))
     scene = served.framing
     if isinstance(spec, MatrixCamera):
         return _matrix_camera(spec, request, scene)
@@ -36,9 +36,10 @@ def resolve_camera(request: RenderRequest, served: ServedScene) -> Camera:
 def _matrix_camera(spec: MatrixCamera, request: RenderRequest, scene: Framing) -> Camera:
     if (spec.fx is None) == (spec.fov_y is None):
         raise InvalidInput("camera.fov_y", "given, or camera.fx", "both" if spec.fx else "neither")
-    if spec.fx is not None and (request.width is None or request.height is None):
+    in_pixels = next((name for name in ("fx", "cx", "cy") if getattr(spec, name) is not None), None)
+    if in_pixels and (request.width is None or request.height is None):
         missing = "width" if request.width is None else "height"
-        raise InvalidInput(missing, "given together with camera.fx, which is in pixels", "nothing")
+        raise InvalidInput(missing, f"given together with camera.{in_pixels}, which is in pixels", "nothing")
     if spec.fx is None and spec.fy is not None:
         raise InvalidInput("camera.fy", "left out without camera.fx", spec.fy)
     width, height = _size(request, scene.width, scene.height)

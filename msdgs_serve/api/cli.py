@@ -62,11 +62,17 @@ def _settings(arguments: Sequence[str]) -> Settings:
         settings = read_settings(arguments)
     except ValidationError as error:
         errors = [item for item in error.errors() if item["type"] != "default_factory_not_called"]  # follows another
-        wrong = [f"--{str(item['loc'][0]).replace('_', '-')}: {item['msg']}" for item in errors]
+        wrong = [f"{_setting(str(item['loc'][0]))}: {item['msg']}" for item in errors]
         raise UsageError("; ".join(wrong)) from None
     if not (settings.scenes or settings.compile):
         raise UsageError(f"no scene given; `{PROGRAM} scene.onnx` serves one, see `{PROGRAM} --help`")
     return settings
+
+
+def _setting(name: str) -> str:
+    """A setting's option, and its environment variable if that is set."""
+    option, variable = f"--{name.replace('_', '-')}", f"MSDGS_{name.upper()}"
+    return f"{option} or {variable}" if variable in os.environ else option
 
 
 def _configure_logging(settings: Settings) -> None:

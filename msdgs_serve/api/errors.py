@@ -222,7 +222,9 @@ def _with_other_slash(request: Request) -> str | None:
 def _field_error(item: Mapping[str, Any]) -> FieldError:
     """Return one of pydantic's errors, without its input, which may be large or not representable in JSON."""
     field, message = _field_name(item["loc"]), message_of(item)
-    if field == "body":
+    if item["type"] == "json_invalid":
+        message = f"isn't JSON from character {item['loc'][-1]} on"
+    elif field == "body":
         message = NOT_JSON
     if item["type"] in ("union_tag_invalid", "union_tag_not_found"):
         field, message = f"{field}.type", "must be one of the types listed at /docs"

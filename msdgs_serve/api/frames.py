@@ -97,7 +97,7 @@ def plan_frame(service: Service, request: RenderRequest) -> FramePlan:
         region=region,
     )
     etag = _etag(scene, request)
-    return FramePlan(request, scene, camera, times, options, channels, _depth_range(request), etag)
+    return FramePlan(request, scene, camera, times, options, channels, _depth_range(request, channels), etag)
 
 
 def draw_frame(service: Service, plan: FramePlan, t: float, job: RenderJob) -> bytes:
@@ -204,9 +204,11 @@ def _background(request: RenderRequest) -> Background:
     return request.background or "transparent"
 
 
-def _depth_range(request: RenderRequest) -> DepthRange | None:
+def _depth_range(request: RenderRequest, channels: Sequence[Channel]) -> DepthRange | None:
     if request.depth_range is None:
         return None
+    if FORMATS[request.format].holds_float or "depth" not in channels:
+        raise InvalidInput("depth_range", "left out unless depth is drawn as png, jpeg or webp", "given")
     near, far = request.depth_range
     if not near < far:
         raise InvalidInput("depth_range", "two depths in increasing order", [near, far])

@@ -104,9 +104,12 @@ def read_keys(path: Path) -> list[Key]:
     """
     try:
         with path.open("rb") as file:
-            lines = file.read(MAX_BYTES).decode().splitlines()
+            contents = file.read(MAX_BYTES + 1)
+        lines = contents.decode("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError):
-        raise InvalidInput("api_keys_file", "a readable text file", path) from None
+        raise InvalidInput("api_keys_file", "a readable text file in UTF-8", path) from None
+    if len(contents) > MAX_BYTES:
+        raise InvalidInput("api_keys_file", f"at most {MAX_BYTES} bytes", f"{path}, which is larger")
     texts = [(number, line.strip()) for number, line in enumerate(lines, 1)]
     keys = [_key_of(number, text) for number, text in texts if text and not text.startswith("#")]
     if len({key.digest for key in keys}) < len(keys) or not keys:

@@ -3,6 +3,7 @@
 from typing import Any
 
 from pydantic import ValidationError
+from starlette.datastructures import QueryParams
 
 from msdgs_serve.api.errors import message_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
@@ -36,6 +37,13 @@ def request_of(query: RenderQuery, metadata: SceneMetadata) -> RenderRequest:
         raise InvalidInput(
             _parameter(first["loc"]), f"as in POST /render ({message_of(first)})", "another value"
         ) from None
+
+
+def refuse_repeated(parameters: QueryParams) -> None:
+    """Raise `InvalidInput` for a parameter that is given twice."""
+    for name in parameters:
+        if len(values := parameters.getlist(name)) > 1:
+            raise InvalidInput(name, "given once; lists are joined by commas", f"{len(values)} times")
 
 
 def by_parameter(error: InvalidInput) -> InvalidInput:

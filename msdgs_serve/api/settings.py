@@ -1,6 +1,8 @@
 """Settings of the service, from flags and from the environment."""
 
 import os
+import re
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,9 +14,14 @@ from pydantic_settings import BaseSettings, EnvSettingsSource, PydanticBaseSetti
 
 from msdgs_serve.api.prefix import read_prefix
 from msdgs_serve.deformation import DeformationSession
+from msdgs_serve.scene import InvalidInput
 from msdgs_serve.scene.onnx import GraphLimits
 from msdgs_serve.store import SceneStore
 from msdgs_serve.threads import thread_count
+
+ORIGIN = re.compile(r"[a-z][a-z0-9+.-]*://[^/,\s\"'\]]+|null", re.IGNORECASE)
+SIMILAR = 0.85
+"""Least similarity of the name of an environment variable to that of a setting for which it is taken as misspelled."""
 
 
 def one_per_thread(settings: dict[str, Any]) -> int:
@@ -28,6 +35,14 @@ def _prefix(text: str) -> str:
     except ValueError:
         message = "must be a path such as /msdgs: from /, without //, . or .., query and host, got '{given}'"
         raise PydanticCustomError("prefix", message, {"given": text[:100]}) from None
+
+
+def _origin(text: str) -> str:
+    origin = text.removesuffix("/")
+    if text != "*" and not ORIGIN.fullmatch(origin):
+        message = "must be origins such as https://example.org or http://localhost:3000, or *, got '{given}'"
+        raise PydanticCustomError("origin", message, {"given": text[:100]})
+    return origin
 
 
 class CommonSettings(BaseModel):
@@ -47,7 +62,7 @@ class CommonSettings(BaseModel):
         default=None,
         description="File with `scopes key` per line, scopes of read, write, operate; requests need a key then.",
     )
-    cors_origins: list[str] = Field(
+    cors_origins: list[Annotated[str, AfterValidator(_origin)]] = Field(
         default=[],
         description="Origins of web pages that may call, such as https://example.org, joined by commas; or *.",
     )
@@ -173,10 +188,24 @@ class Settings(LogSettings, UploadSettings, LimitSettings, CommonSettings, BaseS
 
 def split_list(name: str, value: str) -> list[str]:
     """Return the parts of a setting that is a list: paths are joined as in PATH, others by commas."""
-    return [part for part in value.split(os.pathsep if name == "scenes" else ",") if part]
+    if name == "scenes":
+        return [part for part in value.split(os.pathsep) if part]
+    return [part.strip() for part in value.split(",") if part.strip()]
 
 
 class _Environment(EnvSettingsSource):
+    def __call__(self) -> dict[str, Any]:
+        """Read variables; raises `InvalidInput` for one whose name is almost that of a setting, such as a file of keys
+        that nobody would read."""
+        prefix, names = self.env_prefix.lower(), self.settings_cls.model_fields
+        for variable in os.environ:
+            name = variable.lower().removeprefix(prefix)
+            if name == variable.lower() or name in names:
+                continue
+            if similar := get_close_matches(name, names, 1, SIMILAR):
+                raise InvalidInput(variable, f"called {self.env_prefix}{similar[0].upper()}", "a name that isn't read")
+        return super().__call__()
+
     def decode_complex_value(self, field_name: str, field: FieldInfo, value: Any) -> Any:
         """Split lists instead of parsing JSON."""
         return split_list(field_name, value)

@@ -35,7 +35,7 @@ EXR_NAMES: dict[Channel, tuple[str, ...]] = {
     "rgb": ("R", "G", "B"),
     "alpha": ("A",),
     "depth": ("Z",),
-    "motion": ("forward.u", "forward.v"),
+    "motion": ("forward.u", "forward.v"),  # backward if it points to an earlier time
     "gaussians": ("gaussians",),
 }
 
@@ -57,8 +57,8 @@ def encode(
 
     PNG, JPEG and WebP hold an 8-bit image: sRGB with straight alpha if the image is transparent (not in JPEG),
     or a single channel. EXR holds any channels as 32-bit floats: scene-linear Rec.709 premultiplied R, G, B, A and
-    depth Z, motion as forward.u and forward.v, gaussians, with the camera and the time in its header. NPY holds float32
-    [H, W, C] as rendered: sRGB-encoded color.
+    depth Z, motion as forward.u and forward.v (backward to an earlier time), gaussians, with the camera and the time in
+    its header. NPY holds float32 [H, W, C] as rendered: sRGB-encoded color.
     `quality` in [1, 100] is for JPEG and WebP. Raises `InvalidInput` naming the parameter.
     """
     check_encodable(image.width, image.height, image.transparent, image_format, quality, channels)
@@ -144,6 +144,8 @@ def _exr_pixels(image: Image, channels: Sequence[Channel]) -> np.ndarray:
 
 def _exr_spec(image: Image, channels: Sequence[Channel]) -> oiio.ImageSpec:
     names = [name for channel in channels for name in EXR_NAMES[channel]]
+    if image.motion_dt is not None and image.motion_dt < 0:
+        names = [name.replace("forward", "backward") for name in names]
     spec = oiio.ImageSpec(image.width, image.height, len(names), oiio.FLOAT)
     spec.channelnames = tuple(names)
     if image.region is not None and image.camera is not None:  # data window and display window

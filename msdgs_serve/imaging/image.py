@@ -24,6 +24,7 @@ class Image:
     camera: Camera | None = None  # for formats that store it
     t: float | None = None  # scene time
     motion: FloatArray | None = None  # [H, W, 2] displacement, pixels to the right and down; 0 if alpha is 0
+    motion_dt: float | None = None  # scene time from `t` to where motion points; before `t` if below 0
     gaussians: FloatArray | None = None  # [H, W] number that contribute to each pixel
     region: Region | None = None  # of the camera's image; None: all of it
 

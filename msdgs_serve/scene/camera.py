@@ -55,7 +55,8 @@ class Camera:
             raise InvalidInput("camera.distortion", "0 unless camera.model is fisheye", self.distortion)
 
     def _convert_numbers(self) -> None:
-        """Convert NumPy scalars to Python numbers: kernels are compiled for one type."""
+        """Convert NumPy's numbers to Python's: kernels are compiled for one type. Distortion has any shape, as those of
+        OpenCV."""
         for name in ("fx", "fy", "cx", "cy"):
             try:
                 object.__setattr__(self, name, float(getattr(self, name)))
@@ -64,6 +65,11 @@ class Camera:
         for name in ("width", "height"):
             if isinstance(getattr(self, name), np.integer):
                 object.__setattr__(self, name, int(getattr(self, name)))
+        try:
+            distortion = tuple(np.asarray(self.distortion, np.float64).ravel().tolist())
+        except (TypeError, ValueError):
+            raise InvalidInput("camera.distortion", "4 finite numbers", repr(self.distortion)) from None
+        object.__setattr__(self, "distortion", distortion)
 
     @property
     def world_to_camera(self) -> np.ndarray:
@@ -102,6 +108,17 @@ class Camera:
         sx, sy = width / self.width, height / self.height
         return replace(
             self, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy, width=width, height=height
+        )
+
+    def of_size(self, width: int, height: int) -> "Camera":
+        """Return a camera with the same vertical view and shape of pixels, and another image size: an image of other
+        proportions shows more or less at its sides."""
+        scale, across = height / self.height, width / self.width
+        if min(abs(width - self.width * scale), abs(height - self.height * across)) < 1:
+            return self.resized(width, height)
+        cx = width / 2 + (self.cx - self.width / 2) * scale
+        return replace(
+            self, fx=self.fx * scale, fy=self.fy * scale, cx=cx, cy=self.cy * scale, width=width, height=height
         )
 
     @classmethod

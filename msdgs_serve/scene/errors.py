@@ -6,6 +6,8 @@ MsdgsError
 └── SceneFileInvalid  a scene file violates the contract; `field` names the part of it
 """
 
+import unicodedata
+
 
 class MsdgsError(Exception):
     """Base of all errors that this project raises."""
@@ -29,7 +31,9 @@ class SceneNotFound(MsdgsError, KeyError):
     """No scene of this name is being served."""
 
     def __init__(self, name: str, known: list[str]) -> None:
-        super().__init__(f"no scene `{name}`; known scenes: {', '.join(known) or 'none'}")
+        super().__init__(
+            f"no scene `{name}`; known scenes: {', '.join(known) or 'none'}{_spelled_otherwise(name, known)}"
+        )
         self.name = name
 
     def __str__(self) -> str:
@@ -50,3 +54,12 @@ class SceneFileInvalid(MsdgsError):
     def again(self) -> "SceneFileInvalid":
         """Return a copy without the traceback, which would keep the file's contents in memory."""
         return SceneFileInvalid(self.file, self.field, self.problem, self.details)
+
+
+def _spelled_otherwise(name: str, known: list[str]) -> str:
+    """A hint if a known name has the same letters, but its accents as characters of their own, as on some file systems,
+    or the other way round."""
+    normal = unicodedata.normalize("NFC", name)
+    if any(unicodedata.normalize("NFC", each) == normal for each in known):
+        return ". One looks the same: its file's name has accents in another Unicode form (NFC or NFD); rename the file"
+    return ""

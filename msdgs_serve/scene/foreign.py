@@ -1,6 +1,7 @@
 """Files that people give in place of a scene file, and what to do with them."""
 
 LFS_POINTER = "is a Git LFS pointer, the text that stands for a file not fetched yet: `git lfs pull` fetches it"
+TEXT = "is a text, not a scene file: `msdgs-export model.pt` writes one"
 START_BYTES = 1024
 """Of a file, by which it is known."""
 
@@ -25,7 +26,10 @@ def foreign_file(start: bytes, name: str) -> str | None:
         return foreign_name(name) or f"{_to_import('a zip', name)} if it holds a splat"
     if start.startswith((b"ply\n", b"ply\r", b"NGSP", b"\x1f\x8b")):
         return _to_import("a splat", name)
-    return foreign_name(name)
+    if other := foreign_name(name):
+        return other
+    is_text = start and all(byte >= 32 or byte in b"\t\n\r" for byte in start)
+    return TEXT if is_text else None
 
 
 def foreign_name(name: str) -> str | None:

@@ -5,6 +5,7 @@ import logging
 import os
 import threading
 import time
+import unicodedata
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -209,3 +210,25 @@ def test_only_old_temporary_files_are_removed(folder: Path):
         os.utime(store.incoming(token), (0, time.time() - age))
     store.clear_incoming()
     assert list(folder.iterdir()) == [store.incoming("new")]
+
+
+def test_suffixes_in_capitals_are_named(folder: Path, caplog: pytest.LogCaptureFixture):
+    file = write_scene(folder / "walk.onnx").rename(folder / "walk.ONNX")
+    assert SceneStore([folder]).names() == []
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{file} is not served, as its name doesn't end with .onnx in small letters"
+    ]
+    with pytest.raises(InvalidInput, match="not in small letters"):
+        SceneStore([file])
+
+
+def test_a_name_in_another_unicode_form_is_explained(folder: Path):
+    composed, decomposed = (unicodedata.normalize(form, "café") for form in ("NFC", "NFD"))
+    write_scene(folder / f"{decomposed}.onnx")
+    store = SceneStore([folder])
+    assert store.get(decomposed).name == decomposed
+    with pytest.raises(SceneNotFound, match="looks the same"):
+        store.get(composed)
+    with pytest.raises(SceneNotFound) as error:
+        store.get("cafe")
+    assert "looks the same" not in str(error.value)

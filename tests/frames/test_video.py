@@ -211,6 +211,26 @@ def test_a_video_shows_the_frames(client: httpx.Client, video_format: str):
     assert len(frames_of(by_path.content)[0]) == 5
 
 
+@pytest.mark.parametrize("fps", [24.0, 29.97])
+@pytest.mark.parametrize("video_format", ["mp4", "webm"])
+def test_frames_are_at_their_times_from_0_on(video_format: VideoFormat, fps: float):
+    """Also where the encoder stores them in another order."""
+    file, gray = io.BytesIO(), np.random.default_rng(0).integers(0, 255, (24, 1, 1, 1))
+    write_video((np.full((SIZE, SIZE, 3), value, np.uint8) for value in gray), fps, video_format, file)
+    with av.open(io.BytesIO(file.getvalue()), "r") as container:
+        times = [float(frame.time or 0) for frame in container.decode(video=0)]
+    np.testing.assert_allclose(times, np.arange(24) / fps, atol=1e-3)  # WebM counts milliseconds
+
+
+def test_warnings_about_a_path_are_a_header(client: httpx.Client):
+    rows = [{**CAMERA, "camera_to_world": np.reshape(CAMERA["camera_to_world"], (4, 4)).tolist(), "fov": 0.87}] * 2
+    path = nerfstudio(camera_path=[{**each, "time": 0.5} for each in rows], render_width=float(SIZE))
+    response = client.post("/render/video", json={"path": path})
+    assert response.status_code == 200, response.text
+    assert "`time` of cameras; each `fov` is below 3.15" in response.headers["Msdgs-Warning"]
+    assert "Msdgs-Warning" not in client.post("/render/video", json={"path": nerfstudio(2)}).headers
+
+
 @pytest.mark.parametrize("video_format", ["mp4", "webm"])
 def test_a_video_names_its_colors_as_players_expect(video_format: VideoFormat):
     colors, file = np.uint8(255) * np.eye(3, dtype=np.uint8), io.BytesIO()

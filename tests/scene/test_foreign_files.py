@@ -10,7 +10,7 @@ import pytest
 
 from msdgs_serve.render_cli import main as render
 from msdgs_serve.scene.errors import InvalidInput, SceneFileInvalid
-from msdgs_serve.scene.foreign import foreign_file, is_lfs_pointer
+from msdgs_serve.scene.foreign import TEXT, foreign_file, is_lfs_pointer
 from msdgs_serve.scene.onnx import UNLIMITED
 from msdgs_serve.scene.scene_file import read_scene_file
 from msdgs_serve.store import SceneStore
@@ -81,5 +81,5 @@ def test_a_scene_of_any_name_is_a_scene(tmp_path: Path):
 
 @pytest.mark.parametrize("start", [b"", b"version 1", b"plywood", b"Pk", b"version https://git-lfs.github.com/spec/v1"])
 def test_other_texts_are_none_of_these(start: bytes):
-    assert foreign_file(start, "scene.onnx") is None
+    assert foreign_file(start, "scene.onnx") == (TEXT if start else None)
     assert not is_lfs_pointer(start)

@@ -166,6 +166,37 @@ def test_a_camera_of_the_scene_by_index_or_name(client: httpx.Client):
         assert render(client, camera={"type": "scene", "index": 0}, **size).shape == shape
 
 
+@pytest.mark.parametrize(("width", "height"), [(128, 48), (32, 48), (200, 96)])
+def test_pixels_of_a_camera_of_the_scene_keep_their_shape(client: httpx.Client, width: int, height: int):
+    camera = {"type": "scene", "index": 0}
+    wide, own = (render(client, camera=camera, width=w, height=height) for w in (width, height * 64 // 48))
+    left = (width - own.shape[1]) // 2
+    inner, outer = (own, wide[:, left:]) if left > 0 else (wide, own[:, -left:])
+    np.testing.assert_allclose(outer[:, : inner.shape[1]].astype(int), inner, atol=1)
+
+
+def test_what_has_no_effect_or_lacks_its_size_is_refused(client: httpx.Client):
+    pose = client.get("/scenes/balls").json()["cameras"][0]["camera_to_world"]
+    matrix = {"type": "matrix", "camera_to_world": pose, "fov_y": 40, "cx": 32}
+    check_problem(client.post("/render", json={"camera": matrix, "t": 0.5}), 422, "width")
+    for change in ({}, {"format": "exr", "channels": ["depth"]}, {"channels": ["alpha"]}):
+        check_problem(client.post("/render", json={**FRAME, **change, "depth_range": [1, 9]}), 422, "depth_range")
+    check_problem(client.get("/render?t=0.1&t=0.9"), 422, "t")
+    check_problem(client.get("/render?channels=rgb&channels=depth&format=exr"), 422, "channels")
+
+
+def test_whole_numbers_may_have_a_decimal_point(client: httpx.Client):
+    assert render(client, width=32.0, height=24.0).shape == (24, 32, 3)
+    check_problem(client.post("/render", json={**FRAME, "width": 32.5}), 422, "width")
+
+
+@pytest.mark.parametrize("count", [94, 110])
+def test_the_time_between_frames_reaches_the_end(client: httpx.Client, count: int):
+    body = {**FRAME, "t": np.linspace(0, 1, count)[-2], "dt": 1 / (count - 1), "channels": ["motion"]}
+    assert client.post("/render", json=body).status_code == 200
+    check_problem(client.post("/render", json={**body, "dt": 1.001 / (count - 1)}), 422, "dt")
+
+
 def test_a_scene_without_cameras_is_framed_by_its_bounds(tmp_path: Path):
     with serving(write_scene(tmp_path / "bare.onnx", cameras=())) as client:
         pixels = render(client, camera={"type": "orbit", "azimuth": 0, "elevation": 0}, width=None, height=None)

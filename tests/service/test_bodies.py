@@ -20,6 +20,9 @@ EMPTY_PATH = (
 )
 
 
+MALFORMED = re.compile(r"isn't JSON from character \d+ on")
+
+
 @pytest.fixture(scope="module")
 def client(scene: Path) -> Iterator[httpx.Client]:
     with serving(scene) as client:
@@ -37,7 +40,9 @@ def test_a_body_that_is_no_json_object(client: httpx.Client, path: str, content:
     for kind in ("application/json", "text/plain", "application/x-www-form-urlencoded", "image/png"):
         response = client.post(path, content=content, headers={"Content-Type": kind})
         assert response.status_code in (400, 422)
-        assert response.json()["errors"] == [{"field": "body", "message": NOT_JSON}]
+        ((field, message),) = (each.values() for each in response.json()["errors"])
+        assert field == "body"
+        assert message == NOT_JSON or (kind == "application/json" and MALFORMED.fullmatch(message)), message
         assert not OF_LIBRARIES.search(response.text), response.text
 
 

@@ -167,7 +167,7 @@ def test_what_is_no_number_is_refused_by_name(client: Client, value: Any):
 
 @pytest.mark.parametrize(
     ("t", "width"),
-    [("0.5", 16), (np.bool_(True), 16), (0.5, np.float64(16)), (0.5, True), (0.5, 2**70), ([], 16), ([[0.5]], 16),
+    [("0.5", 16), (np.bool_(True), 16), (0.5, np.float64(16.5)), (0.5, True), (0.5, 2**70), ([], 16), ([[0.5]], 16),
      (np.array([]), 16), (np.zeros((1, 1)), 16), (2.0, 16), (0.5, [16]), (0.5, "16")],
 )  # fmt: skip
 def test_values_that_the_service_refuses_are_problems(client: Client, t: Any, width: Any):

@@ -95,6 +95,8 @@ def test_motion_over_http(scene: Path):
         pixels, spec = decode(http.post("/render", json={**FRAME, "format": "exr"}).content, "exr")
         assert spec.channelnames == ("forward.u", "forward.v")
         np.testing.assert_array_equal(pixels, motion)
+        earlier = decode(http.post("/render", json={**FRAME, "dt": -0.1, "format": "exr"}).content, "exr")[1]
+        assert earlier.channelnames == ("backward.u", "backward.v")
         drawn, _ = decode(http.post("/render", json=FRAME).content, "png")
         assert (drawn[np.abs(motion).max(axis=2) < 1e-6] == 0).all()
         assert drawn.max() > 200

@@ -16,7 +16,7 @@ import pytest
 from msdgs_serve.api.arguments import GROUPS, read_settings
 from msdgs_serve.api.cli import addresses, main
 from msdgs_serve.api.settings import Settings
-from msdgs_serve.threads import THREADS_VARIABLE
+from msdgs_serve.threads import THREADS_VARIABLE, thread_count
 from tests.support.images import decode
 from tests.support.scene_files import write_scene
 from tests.support.service import MAX_SECONDS
@@ -147,7 +147,7 @@ def test_wrong_threads_in_the_environment_are_named(
     monkeypatch.setenv(THREADS_VARIABLE, "abc")
     assert main([str(scene)]) == 2
     complaint = capsys.readouterr().err
-    assert complaint.startswith("msdgs-serve: --threads: ")
+    assert complaint.startswith("msdgs-serve: --threads or MSDGS_THREADS: ")
     assert complaint.count("--") == complaint.count("\n") == 1
 
 
@@ -187,6 +187,45 @@ def test_flags_win_over_the_environment(scene: Path, tmp_path: Path, monkeypatch
     assert (settings.port, settings.max_pixels) == (9001, 500)
     settings = read_settings(["other.onnx"])
     assert settings.scenes == [Path("other.onnx")]
+
+
+@pytest.mark.parametrize(
+    ("variable", "meant"),
+    [
+        ("MSDGS_API_KEY_FILE", "MSDGS_API_KEYS_FILE"),
+        ("MSDGS_MAX_PIXEL", "MSDGS_MAX_PIXELS"),
+        ("msdgs_scene", "MSDGS_SCENES"),
+    ],
+)
+def test_a_misspelled_variable_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], variable: str, meant: str
+):
+    monkeypatch.setenv(variable, "keys")
+    assert main([]) == 2
+    assert f"`{variable}` must be called {meant}" in capsys.readouterr().err
+
+
+def test_other_variables_are_those_of_other_programs(monkeypatch: pytest.MonkeyPatch):
+    for name in ("MSDGS_IMAGE", "MSDGS_SERVICE_HOST", "MSDGS_PORT_8000_TCP", "MSDGS_PLUGINS", "MSDGS_VERSION"):
+        monkeypatch.setenv(name, "any")
+    assert read_settings([]).port == 8000
+
+
+def test_an_empty_variable_is_none(scene: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv(THREADS_VARIABLE, "")
+    assert thread_count() >= 1
+    assert read_settings([str(scene)]).threads is None
+
+
+@pytest.mark.parametrize("origins", ["a.org", '["https://a.org"]', "https://a.org/page", "https://"])
+def test_what_is_no_origin_is_named(capsys: pytest.CaptureFixture[str], origins: str):
+    assert main(["--cors-origins", origins]) == 2
+    assert "--cors-origins: must be origins such as https://example.org" in capsys.readouterr().err
+
+
+def test_origins_may_have_blanks_around_and_a_slash_at_the_end():
+    given = "https://a.org, http://localhost:3000/ ,*"
+    assert read_settings(["--cors-origins", given]).cors_origins == ["https://a.org", "http://localhost:3000", "*"]
 
 
 def test_a_list_is_joined_by_commas_or_given_again():

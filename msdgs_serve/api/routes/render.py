@@ -10,7 +10,7 @@ from fastapi.responses import Response
 
 from msdgs_serve.api.frames import FramePlan, IfNoneMatch, draw_plan, is_unchanged, plan_frame, server_timing
 from msdgs_serve.api.openapi import IMAGE_RESPONSE, NOT_MODIFIED, problems
-from msdgs_serve.api.queries import by_parameter, request_of
+from msdgs_serve.api.queries import by_parameter, refuse_repeated, request_of
 from msdgs_serve.api.schemas import RenderQuery, RenderRequest
 from msdgs_serve.api.service import Service, SharedService
 from msdgs_serve.api.work import unless_gone
@@ -44,6 +44,7 @@ async def render_link(
     """The same for browsers and proxies: `/render?azimuth=30&t=0.5`. The default camera is an orbit view."""
 
     def plan() -> FramePlan:
+        refuse_repeated(request.query_params)
         body = request_of(query, service.scene(query.scene).session.scene.metadata)
         try:
             return plan_frame(service, body)

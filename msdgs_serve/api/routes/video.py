@@ -4,6 +4,7 @@ from collections.abc import AsyncGenerator, Iterator
 from contextlib import aclosing, contextmanager
 from functools import partial
 from typing import BinaryIO, cast
+from urllib.parse import quote
 
 import anyio.to_thread
 from fastapi import APIRouter, Request
@@ -21,6 +22,9 @@ from msdgs_serve.renderer import RenderOptions, check_times
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.store import ServedScene
 from msdgs_serve.video import VIDEO_FORMATS, VideoWriter, require_pyav
+
+MAX_HEADER = 1000  # characters
+PRINTABLE = "".join(map(chr, range(32, 127)))
 
 router = APIRouter(tags=["frames"])
 
@@ -41,7 +45,8 @@ async def render_video(body: VideoRequest, service: SharedService, request: Requ
     scene, path = await anyio.to_thread.run_sync(_path, service, body)
     stream = _stream_video(service, body, scene, path)
     first = await unless_gone(request, anext(stream))  # an error in the first frame still gets its status
-    return StreamingResponse(_joined(first, stream), media_type=VIDEO_FORMATS[body.format].media_type)
+    headers = {"Msdgs-Warning": quote("; ".join(path.warnings)[:MAX_HEADER], safe=PRINTABLE)} if path.warnings else None
+    return StreamingResponse(_joined(first, stream), headers=headers, media_type=VIDEO_FORMATS[body.format].media_type)
 
 
 class _OutputBuffer:
@@ -87,7 +92,8 @@ async def _stream_video(
 
 async def _joined(first: bytes, rest: AsyncGenerator[bytes]) -> AsyncGenerator[bytes]:
     async with aclosing(rest):
-        yield first
+        if first:
+            yield first
         async for piece in rest:
             if piece:
                 yield piece
