@@ -102,15 +102,13 @@ class Paper:
         def write() -> None:
             self._write(replace(results, rows=rows_of(runs, csv)))
 
-        left, complete = runs_left(chosen, csv), True
-        with comparison_progress(len(left)) as advance:
+        with comparison_progress(len(runs_left(chosen, csv))) as advance:
 
             def on_end(run: "Run", end: "RunEnd") -> None:
                 advance(run, end)
                 write()
 
-            if left:
-                complete = train_and_measure(left, csv, processes(self.jobs), on_end)
+            complete = train_and_measure(chosen, csv, processes(self.jobs), on_end)
         write()
         console.print(f"wrote {self.out / self.table}.html and .md; rows in {csv}", soft_wrap=True)
         if not complete:

@@ -175,8 +175,11 @@ def _gains(results: Results) -> Section:
         systems = [results.system(name) for name in (method.name, method.baseline)]
         line = [f"{method.name} over {method.baseline}"]
         for scene in [*scenes, MEAN]:
-            of = list(table.scenes) if scene == MEAN else [scene]
-            line.append(gain(results.rows, of, *systems))
+            if scene == MEAN and NONE in (gain(results.rows, [each], *systems) for each in table.scenes):
+                line.append(NONE)  # the published mean is over all
+            else:
+                of = list(table.scenes) if scene == MEAN else [scene]
+                line.append(gain(results.rows, of, *systems))
             pair = [other.numbers.get(scene) for other in (method, by_name[method.baseline])]
             if scene == MEAN or scene in table.scenes:
                 line[-1] += f" / {pair[0][0] - pair[1][0]:+.2f}" if pair[0] and pair[1] else f" / {NONE}"

@@ -26,7 +26,7 @@ class PaperBudget(Budget):
     """Optimizer steps of each run, instead of the preset's. All schedules are fractions of a run and scale with it."""
 
     def of(self, config: TrainConfig) -> TrainConfig:
-        return Budget.of(replace(self, steps=self.steps or config.run.steps), config)
+        return Budget.of(replace(self, steps=config.run.steps if self.steps is None else self.steps), config)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from msdgs_export.jobs.write import set_properties, storage_differences, write_m
 from msdgs_export.options import ConvertOptions, require_writable
 from msdgs_export.plans.registry import PLANS
 from msdgs_export.progress import tracked
-from msdgs_export.target import MIN_PSNR
+from msdgs_export.target import MIN_PSNR, check_min_psnr
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.framing import framing
 from msdgs_serve.rasterizer import GSPLAT
@@ -53,6 +53,8 @@ def convert(options: ConvertOptions, console: Console) -> None:
     """Write, read back, compare. Raises `InvalidInput`, `SceneFileInvalid` and `ConversionFailed`; a file below the
     minimum PSNR doesn't replace an old one."""
     out = options.out
+    if options.min_psnr is not None:
+        check_min_psnr(options.min_psnr)
     if options.site:
         write_site(DeformationSession(options.scene), options, console)
         return
@@ -72,7 +74,7 @@ def convert(options: ConvertOptions, console: Console) -> None:
     if out.suffix == ONNX and options.t is not None:
         raise InvalidInput("t", "left out for a file that holds all times", options.t)
     session = DeformationSession(options.scene)
-    if out.name.endswith(VISIONARY):
+    if _is_visionary(out):
         written = _visionary(session, options, console)
     elif out.suffix == ONNX:
         written = _stored_anew(session, options, console)
@@ -95,6 +97,10 @@ def convert(options: ConvertOptions, console: Console) -> None:
         console.print(f"it was trained with eps2d {eps2d:g}; programs that add {GSPLAT.eps2d:g} px² draw it {drawn}")
 
 
+def _is_visionary(out: Path) -> bool:
+    return out.suffix == ONNX and out.name.lower().endswith(VISIONARY)
+
+
 def _refuse_options_of_sites(options: ConvertOptions) -> None:
     for name in ("title", "description", "url", "onnxruntime_web"):
         if getattr(options, name) is not None:
@@ -112,7 +118,7 @@ def _note_placement(out: Path, metadata: SceneMetadata, console: Console) -> Non
     place = metadata.scene_to_world
     left = Similarity(place.scale / _written_units(out, metadata), place.offset)
     file = out / PLACEMENT if out.is_dir() else out.with_name(f"{out.name}.{PLACEMENT}")
-    if left.is_identity or (out.suffix == ONNX and not out.name.endswith(VISIONARY)):
+    if left.is_identity or (out.suffix == ONNX and not _is_visionary(out)):
         file.unlink(missing_ok=True)  # of an earlier file of this name
         return
     where = f"in the transform of its {'node' if out.suffix == '.glb' else 'prim'}"
@@ -207,7 +213,7 @@ def _visionary(session: DeformationSession, options: ConvertOptions, console: Co
         shown = visionary_of(temporary)
         worst = min(check.psnr(shown(t), t) for t in times)
         require(worst, options.min_psnr, LOSSY, out.name)
-    scene_json = out.with_name(f"{out.name.removesuffix(VISIONARY)}.scene.json")
+    scene_json = out.with_name(f"{out.name[: -len(VISIONARY)]}.scene.json")
     write_text(scene_json, json.dumps(visionary_scene(out.name, metadata), indent=2) + "\n")
     console.print(f"{scene_json}: the scene.json of a folder for Visionary's editor", markup=False)
     if metadata.antialiasing == "mip":

@@ -15,7 +15,6 @@ from msdgs_export.plans.ellipsoids import ellipsoids
 from msdgs_export.plans.scene_graph import changing_output, finished, new_graph, unit_quats
 from msdgs_export.supports import Layout, SupportInputs, support_export_of
 from msdgs_serve.scene.baked import MOVING_OUTPUTS
-from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_train.gaussians.scale_space import LOG_SCALE_LIMIT, MIN_SCALE
 
@@ -153,9 +152,7 @@ def _scales(graph: GraphBuilder, log_scales: str, deltas: str | None, delta_spac
 
 
 def prefix(baked: Baked, count: int) -> onnx.ModelProto:
-    """The scene with its first `count` layers as trained. Raises `InvalidInput` if it has fewer."""
-    if count > len(baked.layers):
-        raise InvalidInput("plan", f"prefix:k with k from 1 to {len(baked.layers)}, this model's layers", count)
+    """The scene with its first `count` layers as trained."""
     layers, scene, moving = baked.layers[:count], baked.scene, baked.moving
     sh = moving.appearance.get("sh")
     if sh is not None and not heads_of(layers[0]).sh and not any(layer.shades for layer in layers):

@@ -58,7 +58,9 @@ def build(plan: str | PlanSpec, baked: Baked, trajectories: Trajectories | None 
     Fitted plans use the scene's `trajectories`; by default they are sampled. Raises `InvalidInput` for a plan that
     doesn't exist or isn't possible for this scene.
     """
-    spec = parse(plan)
+    spec, layers = parse(plan), max(len(baked.layers), 1)  # any plan is possible for a scene without layers
+    if PLANS[spec.name].counts_layers and (spec.count or 0) > layers:
+        raise InvalidInput("plan", f"{spec.name}:k with k from 1 to {layers}, this model's layers", spec.count)
     if not len(baked.moving):
         return static_graph(baked, str(spec))
     check_appearance(spec, baked.scene.changing)

@@ -33,8 +33,9 @@ class Eval:
     """The folder of the dataset, if it has moved since training."""
     split: Literal["test", "val", "train"] = "test"
     """The images to evaluate on."""
-    sheet: Path = Path("side_by_side.png")
-    """With several runs, the PNG to write: one row per image, with the rendering of each run."""
+    sheet: Annotated[Path | None, optional("PNG")] = None
+    """With several runs, the PNG to write, side_by_side.png by default: one row per image, with the rendering of each
+    run."""
 
     def execute(self) -> int:
         from msdgs_train.evaluation.evaluate import evaluate_run
@@ -43,8 +44,14 @@ class Eval:
 
         if not self.runs:
             raise InvalidInput("RUN", "the folder of one run or more", "none")
+        folders = [run.resolve() for run in self.runs]
+        if again := [run for number, run in enumerate(self.runs) if folders[number] in folders[:number]]:
+            raise InvalidInput("RUN", "different folders", f"{again[0]} twice")
+        sheet = self.sheet or Path("side_by_side.png")
         if len(self.runs) > 1:
-            check_sheet("sheet", self.sheet)
+            check_sheet("sheet", sheet)
+        elif self.sheet is not None:
+            raise InvalidInput("sheet", "left out with one run, whose own sheets are in RUN/eval", self.sheet)
         evaluations = {}
         for run in self.runs:
             with frame_progress(0) as progress:
@@ -57,6 +64,6 @@ class Eval:
                 console.print(note, soft_wrap=True, highlight=False)
             console.print("wrote " + ", ".join(map(str, paths)), soft_wrap=True)
         if len(evaluations) > 1:
-            draw_runs(self.sheet, evaluations)
-            console.print(f"wrote {self.sheet}", soft_wrap=True)
+            draw_runs(sheet, evaluations)
+            console.print(f"wrote {sheet}", soft_wrap=True)
         return 0

@@ -20,6 +20,7 @@ from msdgs_train.cli.view import open_viewer
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.settings import Flag
 from msdgs_train.systems.registry import DEFAULT, preset, systems
+from msdgs_train.systems.unused import refuse_unused
 
 HELP_ALL = "--help-all"
 COMMON = {
@@ -116,7 +117,9 @@ def parse_fit(arguments: Sequence[str]) -> Fit:
         from msdgs_train.engine.run_record import stored_config
 
         # parsed again with the run's own settings as defaults, so that only the given options change them
-        command = _cli(arguments, Fit(command.data, command.run, config=stored_config(command.run)))
+        default = Fit(command.data, command.run, config=stored_config(command.run))
+        command = _cli(arguments, default)
+    refuse_unused(default.config, command.config)
     return command
 
 

@@ -15,6 +15,7 @@ from msdgs_train.gaussians.config import ModelConfig
 from msdgs_train.layers.parts import to_text
 from msdgs_train.settings import optional
 from msdgs_train.systems.registry import DEFAULT, preset, systems
+from msdgs_train.systems.unused import refuse_unused
 
 EVALUATIONS = 10  # number of evaluations of held-out images during training
 LOG_LINES = 100
@@ -141,7 +142,9 @@ def read_system(name: str, table: Mapping[str, Any], budget: Budget) -> TrainCon
     """
     changes = {key: value for key, value in table.items() if key != "preset"}
     try:
-        own = preset(table.get("preset", DEFAULT)).updated(**changes)
+        start = preset(table.get("preset", DEFAULT))
+        own = start.updated(**changes)
+        refuse_unused(start, own)
         shared = budget.of(own)
         replaced = {key for key, *_ in differences(own, shared)}
         for key, value in changes.items():

@@ -2,12 +2,15 @@
 
 import csv
 import fcntl
+import hashlib
 import io
+import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import torch
 from llvmlite.binding import get_host_cpu_name
@@ -18,21 +21,25 @@ from msdgs_train.comparison.matrix import Run
 from msdgs_train.comparison.pools import Pool, RunEnd
 from msdgs_train.comparison.runner import final_metrics, train_all
 from msdgs_train.comparison.scenes import SPLITS
+from msdgs_train.datasets import load_scene
+from msdgs_train.datasets.config import DataConfig
+from msdgs_train.datasets.identity import identity
 from msdgs_train.engine.metrics_log import read_metrics
+from msdgs_train.engine.run_record import read_config, read_record, require_same_dataset
 from msdgs_train.evaluation.evaluate import Evaluation, evaluate_run
 
-BEST = ("best_split", "best_step", "best_psnr")
+BEST, DATASET = ("best_split", "best_step", "best_psnr"), "dataset"
 KEY = ("scene", "system", "seed", "minutes", "time", "threads", "settings")
 COLUMNS = (
     "date", "machine", *KEY, "seconds", "optimizer_steps", "gaussians", "parameters", "modulation_parameters",
     "train_psnr",
     *(f"{split}_{name}" for split in SPLITS for name in ("psnr", "ssim", "lpips", "lpips_01", "moving_psnr", "images")),
-    *BEST,
+    *BEST, DATASET,
 )  # fmt: skip
 """`parameters` are those of the deformation; those of the modulation, embeddings included, are apart. `*_images` has
 the PSNR of each image, in order; `*_moving_psnr` only where the region is known from the images; `train_psnr` is the
-moving average of the last steps. `best_*` are of the best evaluation during training, by the PSNR of a split; rows of
-earlier versions have none."""
+moving average of the last steps. `best_*` are of the best evaluation during training, by the PSNR of a split, and
+`dataset` is a digest of its images, times and cameras; rows of earlier versions lack them."""
 
 Row = dict[str, str]
 
@@ -50,7 +57,7 @@ def key_of_row(row: Row) -> tuple[str, ...]:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a CSV file; none if there is no such file; values of `BEST` are empty where it has no such columns.
+    """The rows of a CSV file; none if there is no such file. `BEST` and `DATASET` are empty where columns are missing.
 
     Raises `InvalidInput` if it has other columns.
     """
@@ -58,9 +65,9 @@ def read_rows(path: Path) -> list[Row]:
         return []
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) not in (COLUMNS, COLUMNS[: -len(BEST)]):
+        if tuple(reader.fieldnames or ()) not in (COLUMNS, COLUMNS[:-1], COLUMNS[: -1 - len(BEST)]):
             raise InvalidInput("csv", f"a file with the columns {', '.join(COLUMNS)}", path)
-        return [dict.fromkeys(BEST, "") | row for row in reader]
+        return [dict.fromkeys((*BEST, DATASET), "") | row for row in reader]
 
 
 def append_row(path: Path, row: Row) -> None:
@@ -81,7 +88,11 @@ def append_row(path: Path, row: Row) -> None:
 def train_and_measure(
     runs: Sequence[Run], csv_file: Path, pool: AbstractContextManager[Pool], on_end: Callable[[Run, RunEnd], None]
 ) -> bool:
-    """Train the runs that have no row in the file, and add their rows; returns False if Ctrl-C has stopped it."""
+    """Train the runs that have no row in the file, and add their rows; returns False if Ctrl-C has stopped it.
+
+    Raises `InvalidInput` if a row or a run of another dataset is in the way, whose folder had the same name.
+    """
+    _require_same_datasets(runs, csv_file)
 
     def finish(run: Run, end: RunEnd) -> None:
         if end.status in ("finished", "was finished"):
@@ -108,6 +119,7 @@ def measure(run: Run) -> Row:
     metrics = final_metrics(run) or {}
     row = dict(zip(KEY, key_of(run), strict=True)) | {
         "date": date.today().isoformat(),
+        DATASET: _digest(dataset_of(run)),
         "machine": _machine(run.config.run.device),
         "seconds": f"{metrics['seconds']:.0f}",
         "optimizer_steps": str(metrics["optimizer_steps"]),
@@ -137,3 +149,32 @@ def _scores(evaluation: Evaluation) -> dict[str, str]:
     numbers = {name: getattr(mean, name) for name in ("psnr", "ssim", "lpips", "lpips_01")} | {"moving_psnr": moving}
     texts = {name: f"{value:.4f}" for name, value in numbers.items() if value is not None}
     return texts | {"images": " ".join(f"{image.psnr:.2f}" for image in model.images)}
+
+
+def dataset_of(run: Run) -> dict[str, Any]:
+    """The identity of the dataset that a run is trained on."""
+    d = run.config.data
+    return identity(load_scene(run.data, d.size, d.llffhold, d.time_from, d.masks))
+
+
+def _digest(dataset: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(dataset, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _require_same_datasets(runs: Sequence[Run], csv_file: Path) -> None:
+    rows = {key_of_row(row): row for row in read_rows(csv_file)}
+    datasets = dict[tuple[Path, DataConfig], dict[str, Any]]()
+    for run in runs:
+        row, record = rows.get(key_of(run)), read_record(run.folder)
+        if record is not None and read_config(run.folder).data != run.config.data:
+            record = None  # refused for its settings
+        if record is None and not (row and row[DATASET]):
+            continue
+        source = run.data, run.config.data
+        if source not in datasets:
+            datasets[source] = dataset_of(run)
+        if record is not None:
+            require_same_dataset(run.folder, record, run.data, datasets[source])
+        if row and row[DATASET] and row[DATASET] != _digest(datasets[source]):
+            problem = f"that of another dataset named {run.scene} than {run.data}"
+            raise InvalidInput("csv", "without rows of other datasets of the same names", f"{csv_file}: {problem}")

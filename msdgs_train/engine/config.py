@@ -45,7 +45,8 @@ class RunConfig(Checked):
     minutes: Annotated[float | None, optional("MINUTES")] = None
     """Length of the run instead of --steps. Each phase gets its fraction of the time; in loops without a growing
     window, steps before motion are instead the same fraction of optimizer steps as with --steps. Evaluation and saving
-    count, compiling kernels doesn't. The same seed no longer gives the same bits."""
+    count, compiling kernels doesn't; a last evaluation of more than a quarter of the time, as of volumes, makes the run
+    longer. The same seed no longer gives the same bits."""
     time: Literal["wall", "cpu"] = "wall"
     """What --minutes and reports count: time that passes, or the CPU time of all threads, which other work on the
     machine hardly changes."""

@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import json
 import math
+import os
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from msdgs_train.engine.observer import Observer
 from msdgs_train.engine.run_record import (
     BEST,
     CHECKPOINT,
+    CONFIG,
     FINAL_METRICS,
     LOCK,
     MODEL,
@@ -101,6 +103,8 @@ def fit(
         with contextlib.closing(state.log), state.lock:
             return Run(state, observer or Observer()).execute()
     except WriteFailed as error:
+        if not os.path.exists(run / CONFIG):  # also where a part of the path is a file
+            raise
         where = "from its last checkpoint" if (run / CHECKPOINT).exists() else "from its start"
         raise WriteFailed(error.filename, error, f"Then --resume continues the run {where}") from error
 
@@ -132,6 +136,9 @@ def prepare(config: TrainConfig, data: Path, folder: Path, *, resume: bool, tens
         seconds = trainer.load_checkpoint(folder / CHECKPOINT) if continues else 0.0
         if stored:
             if stored.run.steps != config.run.steps:
+                if config.run.steps < trainer.step_count:
+                    expected = f"{trainer.step_count} or more, as so many steps are done"
+                    raise InvalidInput("config.steps", expected, config.run.steps)
                 before, milestones = Schedule.from_config(stored), trainer.system.milestones
                 require_same_phase(before, trainer.schedule, trainer.reached, milestones)
             if trainer.step_count >= config.run.steps and stored.run.minutes != config.run.minutes:

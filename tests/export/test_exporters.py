@@ -1,6 +1,7 @@
 """Files for other viewers hold the scene when read back, and keep the rules of their format."""
 
 import json
+import math
 import os
 import struct
 from dataclasses import replace
@@ -405,6 +406,10 @@ def test_an_option_without_effect_and_a_missing_folder_are_refused(tmp_path: Pat
             run(scene, tmp_path / out, t, frames=9)
     with pytest.raises(InvalidInput, match="`out` must be in a folder that exists"):
         run(scene, tmp_path / "nowhere" / "a.ply")
+    for min_psnr in (math.nan, -5.0, 101.0):
+        with pytest.raises(InvalidInput, match="`min_psnr` must be a PSNR in dB"):
+            convert(ConvertOptions(scene, tmp_path / "a.spz", min_psnr=min_psnr), Console(quiet=True))
+    assert not (tmp_path / "a.spz").exists()
 
 
 @pytest.mark.parametrize("name", ["a.compressed.ply", "A.Compressed.PLY", "new.folder.compressed.ply"])

@@ -99,6 +99,9 @@ def test_a_plan_that_this_model_cannot_have_says_what_it_can():
     _, baked = made("plane")
     with pytest.raises(InvalidInput, match=r"prefix:k with k from 1 to 1"):
         build("prefix:2", baked)
+    still = bake(random_model(20, layers=()), SCENE, "0" * 64)
+    with pytest.raises(InvalidInput, match="prefix:k with k from 1 to 1"):
+        build("prefix:7", still)
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -283,6 +283,20 @@ def test_on_a_full_disk_the_last_checkpoint_stays_and_resuming_continues(
     assert not list(run.rglob(".msdgs-*"))
 
 
+def test_fewer_steps_than_are_done_are_refused(run: Path, data: Path, capsys: pytest.CaptureFixture[str]):
+    before = digests(run)
+    error = in_one_line(["fit", str(data), str(run), "--resume", "--steps", "1"], capsys)
+    assert "`config.steps` must be 2 or more, as so many steps are done" in error
+    assert digests(run) == before
+
+
+def test_a_run_below_a_file_has_nothing_to_resume(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "file").touch()
+    error = in_one_line(["fit", str(data), str(tmp_path / "file" / "run"), "--steps", "2", *FEW], capsys)
+    assert "a part of the path is a file" in error
+    assert "--resume" not in error
+
+
 @pytest.mark.slow
 def test_a_disk_that_is_full_from_the_start_is_named(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run, command = tmp_path / "run", ["fit", str(data), str(tmp_path / "run"), "--steps", "2", *FEW]

@@ -108,6 +108,10 @@ def test_an_extra_that_is_missing_is_named_before_anything_is_done(
         ("--support nodes:skinning_lr_final=-1.0", "model.support.skinning_lr_final"),
         ("--support gaussians --layers spline", "without --support nodes"),
         ("--support cage", "gaussians, nodes"),
+        ("--preset deformgs-faithful --eps2d-init 0.9", "`config.eps2d_init`"),
+        ("--preset deformgs-faithful --modulation-targets means", "embedding_dim is 0"),
+        ("--preset sc-gs-small --window-start-width 0.1", "`config.window_start_width`"),
+        ("--preset static --time-noise 0.5", "there are no layers"),
     ],
 )
 def test_wrong_input_is_one_line_and_code_2(

@@ -113,6 +113,7 @@ def test_the_matrix_has_every_cell_once_seed_by_seed(systems_file: Path, tmp_pat
         ("[a]\nsteps = 8000", r"system `a`: `config\.steps` must be not given: --steps sets it .*8000"),
         ("[a]\nseed = 1", r"system `a`.*--seeds"),
         ("[a]\nthreads = 1", r"system `a`.*--threads"),
+        ("[a]\npreset = 'static'\ntime_noise = 0.5", r"system `a`.*time_noise.*there are no layers"),
         ("[a]\neval_every = 5", r"system `a`.*eval_every"),
         ("a = 3", r"`a`"),
         ("['../up']\nsteps = 3", r"up"),
@@ -253,6 +254,13 @@ def test_from_nothing_to_the_table_and_not_again(
     for option, message in (("--size=12", "other settings: size"), ("--jobs=0", "`jobs` must be 1 or more")):
         assert cli.main([*command, option]) == cli.EXIT_INVALID
         assert message in capsys.readouterr().err
+    other = write_scene(tmp_path / "other" / data.name, train=5)
+    assert cli.main(arguments(systems_file, other, tmp_path / "out", "--seeds", "0", "1")) == cli.EXIT_INVALID
+    assert f"{other}, which differs in number of images" in capsys.readouterr().err
+    shared = ["--csv", str(tmp_path / "out" / "comparison.csv")]
+    command = arguments(systems_file, other, tmp_path / "out2", "--seeds", "0", *shared)
+    assert cli.main(command) == cli.EXIT_INVALID
+    assert "that of another dataset named" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("in_threads")

@@ -15,7 +15,18 @@ from msdgs_train.comparison.best import best_as_markdown, best_evaluation
 from msdgs_train.comparison.gains import paired_gain, scenes_as_markdown
 from msdgs_train.comparison.matrix import Budget, Run, make_runs
 from msdgs_train.comparison.report import write_comparison
-from msdgs_train.comparison.rows import BEST, COLUMNS, KEY, Row, append_row, key_of, key_of_row, read_rows, rows_of
+from msdgs_train.comparison.rows import (
+    BEST,
+    COLUMNS,
+    DATASET,
+    KEY,
+    Row,
+    append_row,
+    key_of,
+    key_of_row,
+    read_rows,
+    rows_of,
+)
 from msdgs_train.comparison.scenes import read_scenes
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import preset
@@ -273,14 +284,15 @@ def test_rows_of_several_comparisons_are_kept(tmp_path: Path) -> None:
     assert sorted(int(found["seed"]) for found in read_rows(path)) == list(range(40))
 
 
-def test_rows_of_before_the_best_evaluation_are_read_and_kept(tmp_path: Path) -> None:
+@pytest.mark.parametrize("later", [(DATASET,), (*BEST, DATASET)])
+def test_rows_of_earlier_versions_are_read_and_kept(tmp_path: Path, later: tuple[str, ...]) -> None:
     path, old = tmp_path / "rows.csv", row("s", "a", 0, [1.0])
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [name for name in COLUMNS if name not in BEST], extrasaction="ignore")
+        writer = csv.DictWriter(file, [name for name in COLUMNS if name not in later], extrasaction="ignore")
         writer.writeheader()
         writer.writerow(old)
     assert read_rows(path) == [old]
-    new = row("s", "a", 1, [2.0]) | dict.fromkeys(BEST, "9")
+    new = row("s", "a", 1, [2.0]) | dict.fromkeys(later, "9")
     append_row(path, new)
     assert read_rows(path) == [old, new]
     assert path.read_text().splitlines()[0] == ",".join(COLUMNS)

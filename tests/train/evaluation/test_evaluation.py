@@ -391,6 +391,10 @@ def test_several_runs_are_drawn_side_by_side(run: Path, tmp_path: Path, capsys: 
     assert cli.main(["eval"]) == cli.EXIT_INVALID
     assert cli.main(["eval", str(run), str(other), "--sheet", str(tmp_path / "sheet.gif")]) == cli.EXIT_INVALID
     assert "`sheet` must be a .png file" in capsys.readouterr().err
+    assert cli.main(["eval", str(run), "--sheet", str(tmp_path / "one.png")]) == cli.EXIT_INVALID
+    assert "`sheet` must be left out with one run" in capsys.readouterr().err
+    assert cli.main(["eval", str(run), str(run / ".")]) == cli.EXIT_INVALID
+    assert "`RUN` must be different folders" in capsys.readouterr().err
 
 
 def test_split_without_images_is_named(run: Path, tmp_path: Path) -> None:

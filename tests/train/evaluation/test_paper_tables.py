@@ -9,7 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.paper.tables import Method, PaperBudget, Trained, read_systems, read_table
+from benchmarks.paper.page import Results, sections
+from benchmarks.paper.tables import Method, PaperBudget, Trained, read_systems, read_table, runs_of
+from msdgs_serve.scene.errors import InvalidInput
+from msdgs_train.comparison.rows import COLUMNS
 from msdgs_train.comparison.scenes import Scene
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.schedule import Schedule
@@ -20,6 +23,7 @@ from msdgs_train.layers.parameters import LearningRate
 from msdgs_train.layers.parts import from_plain
 from msdgs_train.layers.plane import PlaneConfig
 from msdgs_train.layers.registry import LAYERS
+from msdgs_train.systems.registry import preset
 from msdgs_train.volumes.hexplane import HexPlaneConfig
 from tests.support.processes import ROOT
 from tests.support.tolerances import assert_close
@@ -271,6 +275,36 @@ def test_systems_have_the_published_parameters() -> None:
         count = sum(p.numel() for layer in layers for p in layer.parameters())
         assert f"{count / 1e6:.2f}" == f"{method['parameters'][0]:.2f}", method["name"]
         assert (model.embedding_dim > 0) == (len(method["parameters"]) == 2)
+
+
+def test_no_steps_are_not_as_many_as_published() -> None:
+    config = preset("deformgs-faithful")
+    assert PaperBudget().of(config).run.steps == config.run.steps
+    with pytest.raises(InvalidInput, match="steps"):
+        PaperBudget(steps=0).of(config)
+
+
+def test_the_mean_gain_is_that_of_all_scenes(tmp_path: Path) -> None:
+    table, budget = read_table("table1"), PaperBudget()
+    scenes = [Scene(name, tmp_path, {}) for name in table.scenes]
+    systems = read_systems(table, scenes, budget, small=True)
+
+    def mean_gain(of: list[Scene]) -> str:
+        psnr = {systems["Ours(MLP)"].system: "31", systems["DeformGS"].system: "30"}
+        found = {"seed": "0", "val_psnr": "", "date": "2026-01-01", "machine": "any", "best_split": ""}
+        rows = [
+            {**dict.fromkeys(COLUMNS, ""), **found, "scene": scene.name, "system": system}
+            | {"test_psnr": value, "test_images": f"{value} {value}"}
+            for scene in of
+            for system, value in psnr.items()
+        ]
+        runs = runs_of(systems, scenes, (0,), tmp_path)
+        results = Results(table, systems, scenes, runs, rows, budget, True)
+        gains = next(section for section in sections(results) if section.heading.startswith("Gain on test images"))
+        return next(line[-1] for line in gains.lines if line[0].startswith("Ours(MLP)"))
+
+    assert mean_gain(scenes) == "+1.00 (+1.00 to +1.00) / +2.59"
+    assert mean_gain(scenes[:-1]) == "– / +2.59"
 
 
 def test_the_page_is_one_file() -> None:
