@@ -105,6 +105,10 @@ class Matrix:
     distortion: Vector | None = None
     type: str = field(default="matrix", init=False)
 
+    def __post_init__(self) -> None:
+        if isinstance(self.distortion, np.ndarray):  # OpenCV's are a row or a column
+            object.__setattr__(self, "distortion", self.distortion.ravel())
+
 
 @dataclass(frozen=True)
 class SceneCamera:

@@ -1,8 +1,10 @@
 """Rendering of a scene at a time, and the cache of its poses."""
 
+import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -119,3 +121,21 @@ def test_a_negative_capacity_is_refused():
     with pytest.raises(InvalidInput) as error:
         Renderer(cache_bytes=-1)
     assert error.value.field == "cache_bytes"
+
+
+def test_options_are_taken_as_arrays_and_refused_by_name(session: DeformationSession):
+    white: Any = np.ones(3)
+    ones: Any = [1, 1, 1]
+    assert RenderOptions(white) == RenderOptions(ones) == RenderOptions((1.0, 1.0, 1.0))
+    assert Renderer().render(session, level_camera(), 0.0, RenderOptions(white)).rgb.max() <= 1
+    for name, value in (
+        ("background", (255, 255, 255)),
+        ("background", "white"),
+        ("background", 1.0),
+        ("background", (math.nan, 0, 0)),
+        ("region", (0, 0, 8, 8)),
+        ("shutter", (0, 0.1)),
+    ):
+        given: Any = {name: value}
+        with pytest.raises(InvalidInput, match=f"`{name}`"):
+            RenderOptions(**given)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from msdgs_serve.client import Matrix, request_body
 from msdgs_serve.framing import framing
 from msdgs_serve.scene import Camera, InvalidInput
 from msdgs_serve.scene.baked import SceneCamera, SceneMetadata
@@ -145,6 +146,27 @@ def test_pose_can_not_be_changed_from_outside():
     assert camera.position[0] == 0
     with pytest.raises(ValueError, match="read-only"):
         camera.camera_to_world[0, 3] = 7
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 1), (1, 4)])
+def test_distortion_is_taken_as_opencv_returns_it(shape: tuple[int, ...]):
+    numbers = 0.1, -0.02, 0.003, -0.0004
+    given: Any = np.reshape(numbers, shape)
+    camera = Camera(10.0, 10.0, 4.0, 3.0, 8, 6, np.eye(4), "fisheye", given)
+    assert camera.distortion == numbers
+    assert Camera(10.0, 10.0, 4.0, 3.0, 8, 6, np.eye(4), distortion=0 * given).distortion == (0.0,) * 4
+    sent = request_body(Matrix(np.eye(4), fx=10, model="fisheye", distortion=given), 0.0)["camera"]
+    assert sent["distortion"] == list(numbers)
+
+
+def test_an_image_of_other_proportions_shows_more_or_less_at_its_sides():
+    camera = Camera(10.0, 12.0, 5.0, 3.0, 8, 6, np.eye(4))
+    wide, narrow = camera.of_size(32, 12), camera.of_size(4, 6)
+    assert (wide.fx, wide.fy, wide.cx, wide.cy) == (20.0, 24.0, 18.0, 6.0)
+    assert (narrow.fx, narrow.fy, narrow.cx, narrow.cy) == (10.0, 12.0, 3.0, 3.0)
+    for width, height in ((16, 12), (17, 13), (801, 600)):
+        alike, resized = camera.of_size(width, height), camera.resized(width, height)
+        assert (alike.fx, alike.fy, alike.cx, alike.cy) == (resized.fx, resized.fy, resized.cx, resized.cy)
 
 
 def test_a_resized_camera_keeps_its_model():

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from starlette.types import Receive, Scope, Send
 
 from msdgs_serve.api.body_limit import BodyLimit
-from msdgs_serve.api.keys import SCOPES, KeyCheck, read_keys
+from msdgs_serve.api.keys import MAX_BYTES, SCOPES, KeyCheck, read_keys
 from msdgs_serve.api.settings import Settings
 from msdgs_serve.scene import InvalidInput
 from tests.support.scene_files import write_scene
@@ -159,6 +159,15 @@ def test_key_files_must_be_text(tmp_path: Path):
     for path in (tmp_path / "keys", tmp_path / "missing", tmp_path):
         with pytest.raises(InvalidInput, match="a readable text file"):
             read_keys(path)
+
+
+def test_key_files_of_windows_and_too_large_ones(tmp_path: Path):
+    keys, line = tmp_path / "keys", f"read {'k' * 40}\n"
+    keys.write_bytes(b"\xef\xbb\xbf" + line.replace("\n", "\r\n").encode())
+    assert [key.scopes for key in read_keys(keys)] == [{"read"}]
+    keys.write_text(line + "#" * MAX_BYTES)
+    with pytest.raises(InvalidInput, match="`api_keys_file` must be at most"):
+        read_keys(keys)
 
 
 def test_an_empty_variable_counts_as_unset(monkeypatch: pytest.MonkeyPatch):
