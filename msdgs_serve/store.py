@@ -21,15 +21,12 @@ from msdgs_serve.files import Signature, move, sync
 from msdgs_serve.files import signature as signature_of
 from msdgs_serve.framing import Framing, framing
 from msdgs_serve.scene import InvalidInput, MsdgsError, SceneFileInvalid, SceneNotFound
-from msdgs_serve.scene.foreign import START_BYTES, foreign_file
 from msdgs_serve.scene.metadata import SceneMetadata
+from msdgs_serve.scene_names import MAX_NAME_BYTES, SUFFIX, checked, is_servable_name
 
-SUFFIX = ".onnx"
 INCOMING_PREFIX = ".incoming-"
 INCOMING_SECONDS = 3600.0
 """Age at which temporary files of uploads are removed."""
-MAX_NAME_BYTES = 200
-"""Limit in UTF-8, so that a name with prefix and suffix is a valid file name on any file system."""
 MAX_OPEN_ATTEMPTS = 5
 RETRY_SECONDS = 10.0
 """Interval of attempts to load a file that failed for a cause outside of it."""
@@ -134,7 +131,7 @@ class SceneStore:
         open_scene: Callable[[Path], DeformationSession] = DeformationSession,
         max_bytes: int = sys.maxsize,
     ) -> None:
-        self._paths = [_checked(Path(path)) for path in paths]
+        self._paths = [checked(Path(path)) for path in paths]
         self.folder = next((path for path in self._paths if path.is_dir()), None)
         self._paths.sort(key=lambda path: path == self.folder)
         self._open_scene, self._max_bytes = open_scene, max_bytes
@@ -375,31 +372,5 @@ class SceneStore:
         return found
 
 
-def is_servable_name(name: str) -> bool:
-    """Whether a name is printable, without separators, and not hidden as temporary files are."""
-    if not (name and name[0] != "." and name.isprintable() and "\\" not in name):
-        return False
-    return len(name.encode()) <= MAX_NAME_BYTES
-
-
 def _exists(name: str) -> SceneExists:
     return SceneExists(f"the scene `{name}` exists already")
-
-
-def _checked(path: Path) -> Path:
-    if path.is_dir():
-        for file in path.iterdir():
-            if file.suffix != SUFFIX and file.suffix.lower() == SUFFIX:
-                logger.warning("%s is not served, as its name doesn't end with %s in small letters", file, SUFFIX)
-        return path
-    if not path.is_file():
-        raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}, which does not exist")
-    if path.suffix != SUFFIX:
-        with path.open("rb") as file:
-            other = foreign_file(file.read(START_BYTES), str(path))
-        in_capitals = ", not in small letters" if path.suffix.lower() == SUFFIX else ""
-        hint = f", which {other}" if other else in_capitals
-        raise InvalidInput("paths", f"{SUFFIX} files and folders of them", f"{path}{hint}")
-    if not is_servable_name(path.stem):
-        raise InvalidInput("paths", "files with printable, unhidden names", repr(path.name))
-    return path

@@ -10,7 +10,8 @@ from starlette.types import Receive, Scope, Send
 
 from msdgs_serve.api.methods import ONLY_HEAD
 from msdgs_serve.scene import SceneFileInvalid
-from msdgs_serve.store import SUFFIX, SceneContents
+from msdgs_serve.scene_names import SUFFIX
+from msdgs_serve.store import SceneContents
 
 MEDIA_TYPE = "application/octet-stream"
 PIECE = 1 << 18

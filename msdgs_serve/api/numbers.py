@@ -7,7 +7,7 @@ from pydantic_core import PydanticCustomError
 
 from msdgs_serve.camera_path import MAX_FPS, MIN_FPS
 from msdgs_serve.scene.camera import MAX_PIXELS_PER_SIDE
-from msdgs_serve.store import MAX_NAME_BYTES
+from msdgs_serve.scene_names import MAX_NAME_BYTES
 
 
 def _whole(value: object) -> object:

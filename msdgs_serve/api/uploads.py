@@ -13,7 +13,7 @@ import anyio
 
 from msdgs_serve.api.errors import RequestRejected
 from msdgs_serve.api.settings import Settings
-from msdgs_serve.store import SUFFIX
+from msdgs_serve.scene_names import SUFFIX
 
 OPENED_AT_ONCE = 2
 OWNER_SUFFIX = ".owner"
