@@ -1,5 +1,7 @@
 """Files that people give in place of a scene file, and what to do with them."""
 
+import codecs
+
 LFS_POINTER = "is a Git LFS pointer, the text that stands for a file not fetched yet: `git lfs pull` fetches it"
 TEXT = "is a text, not a scene file: `msdgs-export model.pt` writes one"
 START_BYTES = 1024
@@ -28,8 +30,15 @@ def foreign_file(start: bytes, name: str) -> str | None:
         return _to_import("a splat", name)
     if other := foreign_name(name):
         return other
-    is_text = start and all(byte >= 32 or byte in b"\t\n\r" for byte in start)
-    return TEXT if is_text else None
+    return TEXT if _is_text(start) else None
+
+
+def _is_text(start: bytes) -> bool:
+    try:
+        text = codecs.getincrementaldecoder("utf-8")().decode(start)  # the last character may be cut off
+    except UnicodeDecodeError:
+        return False
+    return bool(text) and all(character.isprintable() or character in "\t\n\r\ufeff" for character in text)
 
 
 def foreign_name(name: str) -> str | None:

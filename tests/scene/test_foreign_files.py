@@ -79,7 +79,18 @@ def test_a_scene_of_any_name_is_a_scene(tmp_path: Path):
     assert read_scene_file(contents, "scene.zip", UNLIMITED).moving_count
 
 
-@pytest.mark.parametrize("start", [b"", b"version 1", b"plywood", b"Pk", b"version https://git-lfs.github.com/spec/v1"])
+@pytest.mark.parametrize(
+    "start",
+    [
+        b"",
+        b"version 1",
+        b"plywood",
+        b"Pk",
+        b'{"camera_path": []}\r\n',
+        "Größe\n".encode()[:4],
+        b"version https://git-lfs.github.com/spec/v1",
+    ],
+)
 def test_other_texts_are_none_of_these(start: bytes):
     assert foreign_file(start, "scene.onnx") == (TEXT if start else None)
     assert not is_lfs_pointer(start)
