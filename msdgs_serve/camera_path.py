@@ -211,8 +211,13 @@ def _integer(document: Mapping[str, Any], name: str) -> int:
 
 def _matrix(value: Any, name: str) -> np.ndarray:
     """[4, 4] of 16 numbers by rows, or of four rows."""
+    return _numbers(joined_rows(value), 16, name).reshape(4, 4)
+
+
+def joined_rows(value: Any) -> Any:
+    """The numbers of four rows, one after the other; other values as they are."""
     is_nested = isinstance(value, Sequence) and len(value) == 4 and all(isinstance(row, list) for row in value)
-    return _numbers([number for row in value for number in row] if is_nested else value, 16, name).reshape(4, 4)
+    return [number for row in value for number in row] if is_nested else value
 
 
 def _numbers(value: Any, count: int, name: str) -> np.ndarray:

@@ -5,20 +5,15 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, Field
 
 from msdgs_serve.api.numbers import FieldOfView, FramesPerSecond, Number, Pixels, Unit
+from msdgs_serve.camera_path import joined_rows
 
 MAX_TIMES = 1000
-
-
-def _joined(value: Any) -> Any:
-    """The numbers of four rows."""
-    is_nested = isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value)
-    return [number for row in value for number in row] if is_nested else value
 
 
 class PathCamera(BaseModel, extra="allow"):
     """A camera of nerfstudio's camera_path.json, in OpenGL axes; other keys are named in the header Msdgs-Warning."""
 
-    camera_to_world: Annotated[list[Number], BeforeValidator(_joined), Field(min_length=16, max_length=16)] = Field(
+    camera_to_world: Annotated[list[Number], BeforeValidator(joined_rows), Field(min_length=16, max_length=16)] = Field(
         description="4×4 by rows, or as four rows", examples=[[0, 0, 1, 4, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 1]]
     )
     fov: FieldOfView = Field(description="vertical, degrees")

@@ -193,6 +193,12 @@ def split_list(name: str, value: str) -> list[str]:
     return [part.strip() for part in value.split(",") if part.strip()]
 
 
+def _similar(name: str, known: list[str]) -> str | None:
+    """The setting that a misspelled or shortened name stands for, with or without underscores; None if it is none."""
+    shortened = [each for each in known if each.replace("_", "").startswith(name.replace("_", ""))]
+    return next(iter(get_close_matches(name, known, 1, SIMILAR) or shortened), None)
+
+
 class _Environment(EnvSettingsSource):
     def __call__(self) -> dict[str, Any]:
         """Read variables; raises `InvalidInput` for one whose name is almost that of a setting, such as a file of keys
@@ -202,8 +208,8 @@ class _Environment(EnvSettingsSource):
             name = variable.lower().removeprefix(prefix)
             if name == variable.lower() or name in names:
                 continue
-            if similar := get_close_matches(name, names, 1, SIMILAR):
-                raise InvalidInput(variable, f"called {self.env_prefix}{similar[0].upper()}", "a name that isn't read")
+            if name and (meant := _similar(name, list(names))):
+                raise InvalidInput(variable, f"called {self.env_prefix}{meant.upper()}", "a name that isn't read")
         return super().__call__()
 
     def decode_complex_value(self, field_name: str, field: FieldInfo, value: Any) -> Any:

@@ -4,7 +4,6 @@ import contextlib
 import fcntl
 import json
 import math
-import os
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -103,7 +102,7 @@ def fit(
         with contextlib.closing(state.log), state.lock:
             return Run(state, observer or Observer()).execute()
     except WriteFailed as error:
-        if not os.path.exists(run / CONFIG):  # also where a part of the path is a file
+        if not (run / CONFIG).exists():
             raise
         where = "from its last checkpoint" if (run / CHECKPOINT).exists() else "from its start"
         raise WriteFailed(error.filename, error, f"Then --resume continues the run {where}") from error

@@ -195,6 +195,8 @@ def test_flags_win_over_the_environment(scene: Path, tmp_path: Path, monkeypatch
         ("MSDGS_API_KEY_FILE", "MSDGS_API_KEYS_FILE"),
         ("MSDGS_MAX_PIXEL", "MSDGS_MAX_PIXELS"),
         ("msdgs_scene", "MSDGS_SCENES"),
+        ("MSDGS_API_KEYS", "MSDGS_API_KEYS_FILE"),
+        ("MSDGS_APIKEY", "MSDGS_API_KEYS_FILE"),
     ],
 )
 def test_a_misspelled_variable_is_named(
