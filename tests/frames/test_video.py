@@ -222,6 +222,22 @@ def test_frames_are_at_their_times_from_0_on(video_format: VideoFormat, fps: flo
     np.testing.assert_allclose(times, np.arange(24) / fps, atol=1e-3)  # WebM counts milliseconds
 
 
+@pytest.mark.parametrize("video_format", ["mp4", "webm"])
+def test_it_can_be_played_before_all_frames_are_there(video_format: VideoFormat):
+    file, written = io.BytesIO(), []
+
+    def frames() -> Iterator[np.ndarray]:
+        noise = np.random.default_rng(0).integers(0, 255, (SIZE, SIZE, 3), np.uint8)  # key frames would be large
+        for _ in range(100):
+            written.append(file.tell())
+            yield noise
+
+    write_video(frames(), 24, video_format, file)
+    assert written[-1] > 0
+    shown = frames_of(file.getvalue()[: written[-1]])[0]
+    assert len(shown) >= 20
+
+
 def test_warnings_about_a_path_are_a_header(client: httpx.Client):
     rows = [{**CAMERA, "camera_to_world": np.reshape(CAMERA["camera_to_world"], (4, 4)).tolist(), "fov": 0.87}] * 2
     path = nerfstudio(camera_path=[{**each, "time": 0.5} for each in rows], render_width=float(SIZE))
