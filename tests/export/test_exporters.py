@@ -4,33 +4,25 @@ import json
 import math
 import os
 import struct
-from dataclasses import replace
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime as ort
 import pytest
-from onnx import TensorProto, numpy_helper
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from msdgs_export.bake import bake
 from msdgs_export.exporters import gltf
 from msdgs_export.exporters.command import LOSSLESS, LOSSY, convert
 from msdgs_export.exporters.gltf import EXTENSION, read_gltf, write_gltf
 from msdgs_export.exporters.ply import write_ply
 from msdgs_export.exporters.round_trip import ConversionFailed, visionary_of
 from msdgs_export.exporters.usd import read_usd
-from msdgs_export.exporters.visionary import visionary_model
 from msdgs_export.importers.sequence import Frames, read_sequence, sequence_scene
 from msdgs_export.importers.splats.formats import read_splats
 from msdgs_export.options import ConvertOptions
-from msdgs_export.plans.registry import build
 from msdgs_serve.deformation import DeformationSession
-from msdgs_serve.framing import framing
 from msdgs_serve.imaging.image import srgb_to_linear
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_serve.scene.gaussians import Gaussians
@@ -38,24 +30,11 @@ from msdgs_serve.scene.quaternion import to_matrix
 from msdgs_serve.scene.spherical_harmonics import SH_C0
 from msdgs_serve.writing import WriteFailed
 from msdgs_train.gaussians.model_file import SceneInfo
+from tests.support.conversions import QUIET, run, scene_file
 from tests.support.file_sizes import largest_file
-from tests.support.models import MLP, NODES, SCENE, random_model
+from tests.support.models import SCENE
 from tests.support.splat_files import inria_columns, ply_bytes, some_gaussians
 from tests.support.tolerances import tolerance
-
-QUIET = Console(quiet=True)
-
-
-def scene_file(folder: Path, plan: str = "network", info: SceneInfo = SCENE, **config: Any) -> Path:
-    settings: dict[str, Any] = {"layers": (replace(MLP, time_frequencies=2),) * 2} | config
-    model = random_model(300, noise=0.02, **settings)
-    file = folder / "scene.onnx"
-    file.write_bytes(build(plan, bake(model, info, "0" * 64)).SerializeToString())
-    return file
-
-
-def run(scene: Path, out: Path, t: float | None = None, **options: Any) -> None:
-    convert(ConvertOptions(scene, out, t, **options), QUIET)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -315,76 +294,6 @@ def test_opacities_and_colors_that_change_are_those_of_each_time(tmp_path: Path,
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("plan", "config"),
-    [
-        ("network", {}),
-        ("network", {"layers": ("plane", "mlp")}),
-        ("network", {"layers": ("spline", "mlp"), "support": NODES}),
-        ("compact:30", {}),
-        ("compact:60", {}),
-    ],
-)
-def test_visionary_computes_what_the_scene_does(tmp_path: Path, plan: str, config: dict[str, Any]):
-    scene = scene_file(tmp_path, plan, **config)
-    run(scene, tmp_path / "a.visionary.onnx")
-    shown, session = visionary_of(tmp_path / "a.visionary.onnx"), DeformationSession(scene)
-    for t in (0.0, 0.3, 0.77, 1.0):
-        got, expected = shown(t), session.gaussians(t)
-        assert np.abs(got.means - expected.means).max() <= tolerance("export.relative")
-        ours, theirs = covariances(expected), covariances(got)
-        assert np.abs(ours - theirs).max() <= tolerance("visionary.relative") * np.abs(ours).max()
-
-
-def test_visionary_compares_times_of_a_range_whose_ends_round_outwards(tmp_path: Path):
-    low, high = np.array(ends := (0.7, 1.6), np.float32).tolist()
-    assert low < ends[0] < ends[1] < high
-    run(scene_file(tmp_path, info=SceneInfo(time_range=ends, bounds=SCENE.bounds)), tmp_path / "a.visionary.onnx")
-    assert (tmp_path / "a.visionary.onnx").is_file()
-
-
-def covariances(g: Gaussians) -> np.ndarray:
-    axes = to_matrix(g.quats.astype(np.float64)) * g.scales[:, None, :]
-    return axes @ axes.transpose(0, 2, 1)
-
-
-def test_visionary_scene_stands_upright_about_what_its_cameras_look_at(tmp_path: Path):
-    scene = scene_file(tmp_path)
-    run(scene, tmp_path / "a.visionary.onnx")
-    stated = json.loads((tmp_path / "a.scene.json").read_text())
-    metadata = DeformationSession(scene).scene.metadata
-    (asset,) = stated["assets"]
-    assert (tmp_path / asset["path"]).is_file()
-    assert stated["env"]["bgColor"] == [*metadata.background, 1]
-    x, y, z = asset["transform"]["rotationEulerRad"]
-    turns = [Rotation.from_rotvec(angle * axis).as_matrix() for angle, axis in zip((x, y, z), np.eye(3), strict=True)]
-    matrix, view = turns[0] @ turns[1] @ turns[2], framing(metadata)
-    np.testing.assert_allclose(matrix @ view.up, [0, 1, 0], atol=1e-12)
-    np.testing.assert_allclose(matrix @ view.target + asset["transform"]["position"], 0, atol=1e-12)
-
-
-@pytest.mark.parametrize("plan", ["network", "compact:50"])
-def test_visionary_accepts_the_model(tmp_path: Path, plan: str):
-    """Visionary needs opset 17 only, no functions or control flow, finite constants of these types, empty padding."""
-    model = visionary_model(scene_file(tmp_path, plan))
-    outputs, rows = {each.name: each.type.tensor_type for each in model.graph.output}, 512
-    shapes = {name: [each.dim_value for each in kind.shape.dim] for name, kind in outputs.items()}
-    assert [(each.domain, each.version) for each in model.opset_import] == [("", 17)]
-    assert [each.name for each in model.graph.input] == ["time"]
-    assert shapes == {"gaussian_f32": [rows, 10], "color_f16": [rows, 48], "num_points": [1]}
-    assert [kind.elem_type for kind in outputs.values()] == [TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.INT32]
-    assert not model.functions
-    assert not {node.op_type for node in model.graph.node} & {"If", "Loop", "Scan", "SequenceMap", "QuantizeLinear"}
-    casts = {a.i for node in model.graph.node if node.op_type == "Cast" for a in node.attribute}
-    allowed = {TensorProto.FLOAT, TensorProto.INT32, TensorProto.INT64, TensorProto.BOOL}
-    assert casts | {each.data_type for each in model.graph.initializer if each.name != "harmonics"} <= allowed
-    assert all(np.isfinite(numpy_helper.to_array(each)).all() for each in model.graph.initializer)
-    session = ort.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    gaussians, count = session.run(["gaussian_f32", "num_points"], {"time": np.zeros(1, np.float32)})
-    assert not np.asarray(gaussians)[int(np.asarray(count)[0]) :, 3].any()
-
-
 @pytest.mark.parametrize(
     ("plan", "out", "message"),
     [
@@ -408,11 +317,11 @@ def test_an_option_without_effect_and_a_missing_folder_are_refused(tmp_path: Pat
         run(scene, tmp_path / "nowhere" / "a.ply")
     for min_psnr in (math.nan, -5.0, 101.0):
         with pytest.raises(InvalidInput, match="`min_psnr` must be a PSNR in dB"):
-            convert(ConvertOptions(scene, tmp_path / "a.spz", min_psnr=min_psnr), Console(quiet=True))
+            convert(ConvertOptions(scene, tmp_path / "a.spz", min_psnr=min_psnr), QUIET)
     assert not (tmp_path / "a.spz").exists()
 
 
 @pytest.mark.parametrize("name", ["a.compressed.ply", "A.Compressed.PLY", "new.folder.compressed.ply"])
 def test_a_compressed_ply_is_not_written(tmp_path: Path, name: str):
     with pytest.raises(InvalidInput, match=r"`out` must be without \.compressed: .* compressed PLY isn't written"):
-        convert(ConvertOptions(tmp_path / "scene.onnx", tmp_path / name), Console(quiet=True))
+        convert(ConvertOptions(tmp_path / "scene.onnx", tmp_path / name), QUIET)
