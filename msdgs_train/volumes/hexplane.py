@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,7 @@ from msdgs_train.datasets import SceneData
 from msdgs_train.datasets.rays import Rays
 from msdgs_train.layers.arrays import to_device
 from msdgs_train.layers.parameters import ParamGroup, constant
+from msdgs_train.settings import optional
 from msdgs_train.volumes.config import VolumeConfig
 from msdgs_train.volumes.field import Change, RayField, encoded
 from msdgs_train.volumes.samples import Marched, Samples
@@ -28,6 +29,7 @@ AXES = ((0, 1, 2), (0, 2, 1), (1, 2, 0))  # two of a plane in space, and that of
 DENSITY_CHANNELS, COLOR_CHANNELS, COLOR_FEATURES, WIDTH, FREQUENCIES = 24, 48, 27, 128, 2
 INIT_SCALE = 0.1  # standard deviation of the planes' first values
 DENSITY_SHIFT, DISTANCE_SCALE = -10.0, 25.0
+NOMINAL_HALF_SIZE = 1.5  # of the box of D-NeRF's scenes
 STEP = 0.5  # between samples, in vertices
 LEAST_ALPHA = 1e-3  # of a vertex that isn't empty
 LEARNED_ALPHA = 1 - 0.5 ** (1 / DISTANCE_SCALE)  # of a vertex whose samples hide half of what is behind them
@@ -48,8 +50,9 @@ class HexPlaneConfig(VolumeConfig):
     """Vertices along time in the last size; its authors advise 0.24 times the number of training images."""
     first_times: int = 16
     """Vertices along time in the first size; half of those in the last are advised."""
-    box_half_size: float = 1.5
-    """Half the side of the cube around the origin that is modeled, in scene units."""
+    box_half_size: Annotated[float | None, optional("LENGTH")] = None
+    """Half the side of the cube around the origin that is modeled, in scene units. If not given: 1.5 in D-NeRF's
+    scenes; in others what holds the sparse points, or what cameras look at."""
     grid_lr: float = 0.02
     """Learning rate of planes; decays to a tenth, as the other."""
     network_lr: float = 1e-3
@@ -61,11 +64,15 @@ class HexPlaneConfig(VolumeConfig):
         super().__post_init__()
         self.require(("first_voxels",), "a whole number in [64, 1e9]", lambda v: type(v) is int and 64 <= v <= 10**9)
         self.require_counts("times", "first_times", least=2)
-        self.require_positive("box_half_size", "grid_lr", "network_lr")
+        self.require_positive("grid_lr", "network_lr")
+        self.require_positive_or_none("box_half_size")
         self.require_weights("tv_weight")
 
     def box_of(self, scene: SceneData) -> Box:
-        return Box(torch.full((3,), -self.box_half_size), torch.full((3,), self.box_half_size))
+        half_size = self.box_half_size
+        if half_size is None:
+            half_size = NOMINAL_HALF_SIZE if scene.has_nominal_size else scene.scene_half_size
+        return Box(torch.full((3,), -half_size), torch.full((3,), half_size))
 
     def build(self, box: Box) -> "HexPlane":
         return HexPlane(self, box)
@@ -128,7 +135,8 @@ class HexPlane(RayField):
         distances = self._distances(rays.origins.device)
         if generator is not None:  # all rays alike
             shift = to_device(torch.rand(len(distances), generator=generator), distances.device)
-            distances = distances + shift * ((self.config.far - self.config.near) / len(distances))
+            near, far = self.config.depths
+            distances = distances + shift * ((far - near) / len(distances))
         directions = functional.normalize(rays.directions, dim=1)
         points = rays.origins[:, None] + directions[:, None] * distances[:, None]
         samples = Samples.of(points, functional.pad(distances.diff(), (0, 1)), self.box.contains(points))
@@ -138,7 +146,7 @@ class HexPlane(RayField):
 
     def _distances(self, device: torch.device) -> Tensor:
         count = int(3**0.5 * self.resolution / STEP)
-        return torch.linspace(self.config.near, self.config.far, count, device=device)
+        return torch.linspace(*self.config.depths, count, device=device)
 
     def optical_depths(self, samples: Samples, rays: Rays) -> tuple[Tensor, Tensor]:
         points, times = self._places(samples, rays)

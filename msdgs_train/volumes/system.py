@@ -45,7 +45,7 @@ class VolumeSystem:
         config = schedule.config
         assert isinstance(config.own, VolumeConfig)
         _refuse_unused(config)
-        self.schedule, self.config, self.scene, self.settings = schedule, config, scene, config.own
+        self.schedule, self.config, self.scene, self.settings = schedule, config, scene, config.own.sized(scene)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.run.seed)
             self.model = self.settings.build(self.settings.box_of(scene)).to(config.run.device)

@@ -62,11 +62,11 @@ class TiNeuVoxConfig(VolumeConfig):
 
     def box_of(self, scene: SceneData) -> Box:
         """Around all training rays from near to far, and a twentieth larger."""
-        ends = []
+        ends, (near, far) = [], self.depths
         for frame in scene.splits["train"]:
             rays = rays_of(frame.camera, frame.t)
             views = functional.normalize(rays.directions, dim=1)
-            points = torch.cat([rays.origins + self.near * views, rays.origins + self.far * views])
+            points = torch.cat([rays.origins + near * views, rays.origins + far * views])
             ends.append(torch.stack(points.aminmax(dim=0)))
         low, high = torch.stack(ends)[:, 0].amin(dim=0), torch.stack(ends)[:, 1].amax(dim=0)
         margin = (BOX_SCALE - 1) / 2 * (high - low)
@@ -119,7 +119,7 @@ class TiNeuVox(RayField):
             raise InvalidInput("voxel_size", "that of a stage", float(self.voxel_size))
 
     def samples(self, rays: Rays, generator: torch.Generator | None) -> Samples:
-        edge, near, far = STEP * self.voxel_size, self.config.near, self.config.far
+        edge, (near, far) = STEP * self.voxel_size, self.config.depths
         enters, leaves = (along.clamp(near, far) for along in self.box.spans(rays.origins, rays.directions))
         counts = ((leaves - enters) / edge).ceil().clamp(min=1)
         steps = torch.arange(int(counts.max()), device=counts.device)

@@ -101,7 +101,7 @@ def in_float64() -> Iterator[None]:
 
 
 def hexplane(**sizes: int) -> HexPlane:
-    return HexPlane(HexPlaneConfig(**sizes), Box(torch.full((3,), -1.5), torch.full((3,), 1.5)))
+    return HexPlane(HexPlaneConfig(near=2.0, far=6.0, **sizes), Box(torch.full((3,), -1.5), torch.full((3,), 1.5)))
 
 
 @pytest.mark.usefixtures("in_float64")
@@ -123,7 +123,7 @@ def test_hexplane_as_its_repository() -> None:
 def test_tineuvox_as_its_repository(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tineuvox_module, "GROWS_AT", (GROWN_AFTER / 20_000,))
     want = vectors("tineuvox")
-    field = TiNeuVoxConfig(voxels=VOXELS).build(Box(*torch.from_numpy(want["box"])))
+    field = TiNeuVoxConfig(voxels=VOXELS, near=2.0, far=6.0).build(Box(*torch.from_numpy(want["box"])))
     load_seeded(field, TINEUVOX_NAMES)
     scene = scene_of_rays()
     with torch.no_grad():

@@ -1,16 +1,18 @@
 """The presets of volumes on a tiny scene: learning, growth, resuming, model files, evaluation, comparison, refusals."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from msdgs_export.jobs.checkpoint import Checkpoint
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.cli import main as cli
-from msdgs_train.datasets import load_scene
+from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.run import fit
 from msdgs_train.engine.run_record import CHECKPOINT, MODEL
@@ -175,11 +177,55 @@ def test_settings_of_gaussians_are_refused(data: Path) -> None:
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("rays", 0), ("near", 7.0), ("voxels", 10), ("width", 1), ("first_alpha", 1.0), ("entropy_weight", -1.0)],
+    [
+        ("rays", 0),
+        ("near", -1.0),
+        ("far", 0.0),
+        ("voxels", 10),
+        ("width", 1),
+        ("first_alpha", 1.0),
+        ("entropy_weight", -1.0),
+    ],
 )
 def test_settings_out_of_range_are_named(setting: str, value: object) -> None:
-    with pytest.raises(InvalidInput, match=r"`config\.(far|" + setting + ")`"):
+    with pytest.raises(InvalidInput, match=rf"`config\.{setting}`"):
         preset("tineuvox-s").updated(**{setting: value})
+
+
+def _volume(config: TrainConfig, scene: SceneData) -> VolumeSystem:
+    system = Trainer(config, scene).system
+    assert isinstance(system, VolumeSystem)
+    return system
+
+
+@pytest.mark.parametrize("has_points", [True, False])
+@PRESETS
+def test_lengths_are_those_of_the_scene(name: str, data: Path, has_points: bool) -> None:
+    """D-NeRF's stay as published. In others rays and box hold what the images show; here a cloud of radius 5."""
+    scene = load_scene(data)
+    own = _volume(small(name), scene).settings
+    assert own.depths == (2, 6)
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    points *= 5 / np.linalg.norm(points, axis=1, keepdims=True)
+    other = replace(scene, has_nominal_size=False, scene_half_size=5.0, points=points if has_points else None)
+    system = _volume(small(name), other)
+    near, far = system.settings.depths
+    assert 0 < near < far
+    shares = []
+    for frame in scene.splits["train"]:
+        pixels, depths = frame.camera.project(points)
+        seen = (depths > 0) & ((pixels >= 0) & (pixels < (frame.camera.width, frame.camera.height))).all(axis=1)
+        in_box = system.model.box.contains(torch.from_numpy(points[seen]).float()).numpy()
+        shares.append((in_box & (depths[seen] >= near) & (depths[seen] <= far)).mean())
+    assert np.mean(shares) > 0.95
+    given = small(name).updated(near=1.5, far=5.0)
+    assert _volume(given, other).settings.depths == (1.5, 5.0)
+
+
+@pytest.mark.parametrize(("setting", "value", "message"), [("near", 7.0, "below 6"), ("far", 1.0, "above 2")])
+def test_one_length_beyond_the_other_is_named(data: Path, setting: str, value: float, message: str) -> None:
+    with pytest.raises(InvalidInput, match=rf"`config\.{setting}` must be {message}, where the scene"):
+        _volume(small("tineuvox-s", **{setting: value}), load_scene(data))
 
 
 def test_a_checkpoint_of_other_sizes_is_refused(data: Path, tmp_path: Path) -> None:
