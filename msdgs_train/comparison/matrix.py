@@ -117,8 +117,10 @@ def _digest(config: TrainConfig, scene: Scene) -> str:
 
 
 def _changed(config: TrainConfig) -> dict[str, Any]:
-    """By group, the settings besides threads that differ from those of msdgs-small, or of the model's defaults."""
-    default, changed = preset("msdgs-small").updated(model=ModelConfig()).to_dict(), config.to_dict()
+    """By group, the settings besides threads that differ from those of msdgs-small, or of the defaults of the model and
+    of the system."""
+    own = type(config.own)()
+    default, changed = preset("msdgs-small").updated(model=ModelConfig(), own=own).to_dict(), config.to_dict()
     del changed["run"]["threads"]
     for group, values in changed.items():
         changed[group] = {n: v for n, v in values.items() if n not in default[group] or v != default[group][n]}

@@ -27,7 +27,7 @@ from msdgs_train.comparison.rows import (
     read_rows,
     rows_of,
 )
-from msdgs_train.comparison.scenes import read_scenes
+from msdgs_train.comparison.scenes import Scene, read_scenes
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.systems.registry import preset
 from tests.support.processes import ROOT
@@ -201,6 +201,24 @@ def test_a_new_setting_leaves_rows_as_they_are(data: Path, monkeypatch: pytest.M
     monkeypatch.setattr(TrainConfig, "to_dict", extended)
     assert make(data, Budget())[0].settings == before.settings
     assert make(data, Budget(steps=7))[0].settings != seven.settings
+
+
+def test_a_new_setting_of_a_system_leaves_its_rows_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    to_dict, scene = TrainConfig.to_dict, Scene("toys", tmp_path, {})
+
+    def settings(**changes: Any) -> str:
+        (run,) = make_runs({"a": preset("hexplane-slim").updated(**changes)}, [scene], [0], tmp_path / "out")
+        return run.settings
+
+    def extended(config: TrainConfig) -> dict[str, Any]:
+        values = to_dict(config)
+        return values | {"own": values["own"] | {"new_weight": 0.5 if config.run.steps == 7 else 0.0}}
+
+    before, seven = settings(), settings(steps=7)
+    assert settings(rays=64) != before
+    monkeypatch.setattr(TrainConfig, "to_dict", extended)
+    assert settings() == before
+    assert settings(steps=7) != seven
 
 
 def test_a_row_is_of_the_scenes_own_settings(tmp_path: Path) -> None:
