@@ -50,7 +50,7 @@ BT709 = 1  # as colorspace, primaries and transfer function alike
 LIMITED_RANGE = 1
 
 # fragmented mp4 can be played while it is received; its header waits for the first fragment, by which it knows that the
-# times of frames, which x264 reorders, begin at 0: fragments are short; animated WebP loops forever
+# times of frames, which x264 reorders, begin at 0, so a fragment is a second; animated WebP loops forever
 MUXER_OPTIONS: dict[VideoFormat, dict[str, str]] = {
     "mp4": {"movflags": "frag_keyframe+delay_moov+default_base_moof", "frag_duration": "1000000"},  # microseconds
     "webm": {"cluster_time_limit": "1000"},  # milliseconds

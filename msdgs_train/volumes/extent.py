@@ -19,16 +19,17 @@ MIN_RATIO = 0.02
 
 
 def depth_range(scene: "SceneData") -> tuple[float, float]:
-    """Depths, in scene units, between which the training images show the scene: those of the sparse points in them, or
-    else of the ball around the cube that holds it."""
+    """Where rays begin and end, in scene units, so that they hold what the training images show: the sparse points in
+    them, or else the ball around the cube that holds the scene. By depth and by distance along rays alike."""
     if scene.has_nominal_size:
         return NOMINAL
     cameras = [frame.camera for frame in scene.splits["train"]]
-    depths = np.zeros(0)
+    seen = np.zeros((0, 2))
     if scene.points is not None:
-        depths = np.concatenate([_depths_in_image(camera, scene.points) for camera in cameras])
-    if len(depths):
-        near, far = np.quantile(depths, [OUTLIERS, 1 - OUTLIERS]) * (1 / MARGIN, MARGIN)
+        seen = np.concatenate([_seen(camera, scene.points) for camera in cameras])
+    if len(seen):
+        depths, distances = seen.T  # a point's depth is the smaller of both
+        near, far = np.quantile(depths, OUTLIERS) / MARGIN, np.quantile(distances, 1 - OUTLIERS) * MARGIN
     else:
         radius = 3**0.5 * scene.scene_half_size
         distances = [np.linalg.norm(camera.position) for camera in cameras]
@@ -36,7 +37,8 @@ def depth_range(scene: "SceneData") -> tuple[float, float]:
     return max(float(near), MIN_RATIO * float(far)), float(far)
 
 
-def _depths_in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
+def _seen(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """[M, 2] depths and distances of the points that an image shows."""
     pixels, depths = camera.project(points)
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    return depths[inside & (depths > 0)]
+    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (depths > 0)
+    return np.column_stack([depths, np.linalg.norm(points - camera.position, axis=1)])[inside]
