@@ -98,6 +98,15 @@ class Camera:
             plane = plane * np.where(radii > 0, stretch, 1)[:, None]
         return plane * (self.fx, self.fy) + (self.cx, self.cy), depths
 
+    def visible_depths(self, points: np.ndarray) -> np.ndarray:
+        """Depths along the axis [N] of world points [N, 3] in scene units; 0 for points that aren't in the image.
+
+        What hides a point isn't known.
+        """
+        pixels, depths = self.project(points)
+        inside = (pixels >= 0) & (pixels < (self.width, self.height))
+        return np.where(inside.all(axis=1), np.maximum(depths, 0), 0)
+
     @property
     def position(self) -> np.ndarray:
         """[3] center of projection in world space; for an orthographic camera, a point on its axis."""

@@ -49,9 +49,7 @@ def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """[N] number of the cameras that have each point, [N, 3], in their image."""
     counts = np.zeros(len(points), np.int64)
     for camera in cameras:
-        pixels, depths = camera.project(points)
-        inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
-        counts += inside.all(axis=1) & (depths > 0)
+        counts += camera.visible_depths(points) > 0
     return counts
 
 

@@ -39,6 +39,5 @@ def depth_range(scene: "SceneData") -> tuple[float, float]:
 
 def _seen(camera: Camera, points: np.ndarray) -> np.ndarray:
     """[M, 2] depths and distances of the points that an image shows."""
-    pixels, depths = camera.project(points)
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1) & (depths > 0)
-    return np.column_stack([depths, np.linalg.norm(points - camera.position, axis=1)])[inside]
+    depths = camera.visible_depths(points)
+    return np.column_stack([depths, np.linalg.norm(points - camera.position, axis=1)])[depths > 0]

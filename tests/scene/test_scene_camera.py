@@ -24,6 +24,12 @@ def test_identity_pose_is_opencv():
     assert_close(pixel_of(camera, [0, 1, 5]), [50, 80], "pixel")  # y: down
 
 
+def test_points_outside_of_the_image_have_no_visible_depth():
+    camera = Camera(100.0, 200.0, 50.0, 40.0, 100, 80, np.eye(4))
+    points = [[0, 0, 5], [-2.5, 0, 5], [2.5, 0, 5], [0, -1, 5], [0, 1, 5], [0, 0, -5], [0, 0, 0], [math.nan, 0, 5]]
+    assert camera.visible_depths(np.array(points)).tolist() == [5, 5, 0, 5, 0, 0, 0, 0]
+
+
 def test_world_to_camera_is_the_inverse():
     camera = random_camera(np.random.default_rng(0), 53, 37)
     assert_close(camera.world_to_camera @ camera.camera_to_world, np.eye(4), "rotation")

@@ -85,10 +85,9 @@ def seen_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
     """The median depth of the points, [M, 3], or evenly chosen ones, in the image of each camera that sees any."""
     depths, points = [], points[:: max(1, len(points) // MAX_POINTS)]
     for camera in cameras:
-        pixels, z = camera.project(points)
-        inside = (z > 0) & (pixels >= 0).all(axis=1) & (pixels <= (camera.width, camera.height)).all(axis=1)
-        if inside.any():
-            depths.append(float(np.median(z[inside])))
+        visible = camera.visible_depths(points)
+        if visible.any():
+            depths.append(float(np.median(visible[visible > 0])))
     return depths
 
 
