@@ -53,6 +53,9 @@ class SCGS(GaussianSplatting):
             raise InvalidInput("model.support", "scgs, with a layer, for sc-gs", config.model.support.kind)
         if config.density.density_strategy != "gradient":
             raise InvalidInput("config.density_strategy", "gradient with sc-gs", config.density.density_strategy)
+        if config.curriculum.restart_at_motion:
+            expected = "off with sc-gs, whose second stage starts Adam, its rates and density control again"
+            raise InvalidInput("config.restart_at_motion", expected, True)
         super().__init__(schedule, scene)
         self.step, self.stages = 0, self._stages(schedule.num_steps)
         self.first_steps = self.stages[0].num_steps

@@ -153,3 +153,8 @@ def test_nodes_that_no_gaussian_follows_are_removed_and_busy_ones_divided(data: 
 def test_other_supports_are_refused(data: Path):
     with pytest.raises(InvalidInput, match=r"model\.support.*scgs.*gaussians"):
         Trainer(preset("deformgs").updated(system="sc-gs", own=preset("sc-gs").own), load_scene(data))
+
+
+def test_another_restart_than_that_of_its_stages_is_refused(data: Path):
+    with pytest.raises(InvalidInput, match=r"config\.restart_at_motion.*stage"):
+        Trainer(small_config(restart_at_motion=True), load_scene(data))
