@@ -47,6 +47,10 @@ class DensityConfig(Checked):
     prune_unseen_passes: float = 0.0
     """gradient: Gaussians that no image shows in so many passes over the cameras are removed, and those outside an
     image whose border is empty all around; 0: never."""
+    prune_subpixel: float = 0.0
+    """gradient: Gaussians whose largest standard deviation is below this fraction of a pixel are removed; the blur of
+    the rasterizer (--eps2d) still shows them, as dots, which may become opaque and multiply in dark images. 0: never.
+    """
     prune_scale3d: float = 0.1
     """gradient: Gaussians larger than this fraction of the scene's scale are removed after a reset of opacities."""
     reset_every_fraction: float = 0.0
@@ -67,7 +71,7 @@ class DensityConfig(Checked):
         self.require_fractions("reset_every_fraction", "prune_opa", "init_min_views")
         self.require_fractions(*(["init_gray"] if self.init_gray is not None else []))
         self.require_positive("grow_grad2d", "grow_scale3d", "prune_scale3d")
-        self.require_weights("noise_lr", "prune_unseen_passes")
+        self.require_weights("noise_lr", "prune_unseen_passes", "prune_subpixel")
         self.require_weights(*(n for n in ("opacity_reg", "scale_reg") if getattr(self, n) is not None))
         few = "a whole number of init_num_pts or more, or None"
         self.require(("max_gaussians",), few, lambda v: v is None or (type(v) is int and v >= self.init_num_pts))

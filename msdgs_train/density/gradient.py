@@ -5,6 +5,7 @@ removed.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,8 +13,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from msdgs_serve.scene import Camera
 from msdgs_train.density.strategy import DensityStrategy
 from msdgs_train.engine.schedule import Schedule
+from msdgs_train.gaussians.bounds import pixel_sizes
 from msdgs_train.gaussians.canonical import CanonicalGaussians
 from msdgs_train.gaussians.surgery import RowSurgery
 from msdgs_train.layers.quaternions import rotate
@@ -43,17 +46,26 @@ class GradientStrategy(DensityStrategy):
     counts: Tensor  # [N] images in which each was drawn
     unseen: Tensor  # [N] images since each was seen; infinite once it was outside of the whole scene
     patience: float  # images after which a Gaussian that none shows is removed; 0: never
+    cameras: Sequence[Camera]  # of the training images, each pose once
     is_rig: bool  # cameras that stand still: a time window has images of all of them
 
     @classmethod
     def start(
-        cls, schedule: Schedule, max_gaussians: int, scene_scale: float, count: int, views: int, is_rig: bool
+        cls,
+        schedule: Schedule,
+        max_gaussians: int,
+        scene_scale: float,
+        count: int,
+        cameras: Sequence[Camera],
+        is_rig: bool,
     ) -> "GradientStrategy":
-        """A new strategy for `count` Gaussians and so many cameras."""
-        patience = schedule.config.density.prune_unseen_passes * max(views, MIN_PATIENCE)
+        """A new strategy for `count` Gaussians."""
+        patience = schedule.config.density.prune_unseen_passes * max(len(cameras), MIN_PATIENCE)
         generator = torch.Generator().manual_seed(schedule.config.run.seed + 1)
         gradients, counts, unseen = torch.zeros(3, count, device=schedule.config.run.device)
-        return cls(schedule, generator, max_gaussians, scene_scale, gradients, counts, unseen, patience, is_rig)
+        return cls(
+            schedule, generator, max_gaussians, scene_scale, gradients, counts, unseen, patience, cameras, is_rig
+        )
 
     def accumulate(self, screen: RasterizationInfo, width: int, height: int, shows_all: bool) -> None:
         """Accumulate one view, which shows the Gaussians that have a gradient."""
@@ -91,7 +103,8 @@ class GradientStrategy(DensityStrategy):
         """Clone small and split large Gaussians of large gradients, remove low-opacity and huge ones, and reset."""
         gaussians = surgery.gaussians
         with torch.no_grad():
-            hidden, sizes = self._hidden(gaussians), gaussians.log_scales.exp().amax(dim=1)
+            sizes = gaussians.log_scales.exp().amax(dim=1)
+            hidden = self._hidden(gaussians, sizes)
             chosen, large = self._to_densify(hidden), sizes > self.config.grow_scale3d * self.scene_scale
             pruned = self._to_prune(hidden, torch.where(chosen & large, sizes / SPLIT_SHRINK, sizes), step)
             chosen &= ~pruned
@@ -110,9 +123,11 @@ class GradientStrategy(DensityStrategy):
         ceiling = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
         surgery.replace_values("raw_opacities", surgery.gaussians.raw_opacities.detach().clamp(max=ceiling))
 
-    def _hidden(self, gaussians: CanonicalGaussians) -> Tensor:
-        """[N] bool: of low opacity, or unseen for too long."""
+    def _hidden(self, gaussians: CanonicalGaussians, sizes: Tensor) -> Tensor:
+        """[N] bool: of low opacity, unseen for too long, or far smaller than a pixel."""
         hidden = gaussians.raw_opacities.sigmoid() < self.config.prune_opa
+        if self.config.prune_subpixel:
+            hidden |= sizes < self.config.prune_subpixel * pixel_sizes(gaussians.means, self.cameras)
         if self.patience:
             hidden |= self.unseen > self.patience
         if bool(hidden.all()):  # a scene that is wholly transparent keeps its Gaussians and may recover

@@ -5,6 +5,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from msdgs_serve.scene import Camera
 from msdgs_train.datasets import Frame
@@ -51,6 +52,14 @@ def views_of(points: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     for camera in cameras:
         counts += camera.visible_depths(points) > 0
     return counts
+
+
+def pixel_sizes(points: Tensor, cameras: Sequence[Camera]) -> Tensor:
+    """[N] width of a pixel at each point, [N, 3], in scene units, in the camera where it is smallest; whether that one
+    shows the point isn't checked."""
+    positions = points.new_tensor(np.array([camera.position for camera in cameras]))
+    focal_lengths = points.new_tensor([max(camera.fx, camera.fy) for camera in cameras])
+    return (torch.cdist(points, positions) / focal_lengths).amin(dim=1)
 
 
 def scene_bounds(

@@ -78,8 +78,7 @@ class GaussianSplatting:
         """Density control of the present Gaussians from the start of a schedule."""
         if schedule.config.density.density_strategy == "mcmc":
             return MCMCStrategy.start(schedule, max_gaussians)
-        views = len(self.distinct)
-        return GradientStrategy.start(schedule, max_gaussians, self.scale, self.size, views, self.is_rig)
+        return GradientStrategy.start(schedule, max_gaussians, self.scale, self.size, self.distinct, self.is_rig)
 
     @property
     def size(self) -> int:

@@ -161,6 +161,7 @@ def test_without_layers_any_support_trains_a_static_scene(support: SupportConfig
         ("ssim_lambda", 1.5), ("ssim_lambda", float("nan")), ("means_lr_init", 0.0),
         ("adam_beta2", 1.0), ("adam_eps", 0.0), ("gradient_clip", 0.0), ("means_lr_until_fraction", 0.0),
         ("mse_fraction", 1.1), ("alpha_weight", -1.0), ("prune_unseen_passes", -1.0),
+        ("prune_subpixel", -0.1),
         ("init_min_views", 1.1), ("ema_fraction", -0.1),
         ("max_gaussians", 10), ("background", "green"), ("minutes", 0.0), ("refine_every_fraction", -0.1),
         ("quats_lr", float("inf")), ("size", 0), ("density_strategy", "none"), ("noise_lr", -1.0),

@@ -4,9 +4,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from msdgs_serve.scene import Camera
+from msdgs_serve.scene.camera import look_at
 from msdgs_train.datasets import load_scene
 from msdgs_train.density.config import DensityConfig
 from msdgs_train.density.gradient import MIN_PATIENCE, SPLIT_SHRINK, GradientStrategy
@@ -26,8 +29,16 @@ def _setup(count: int = 6, **changes: Any) -> tuple[CanonicalGaussians, RowSurge
     gaussians = CanonicalGaussians.random_in_cube(count, 1.0, 1, 0, schedule.config.model.attributes())
     with torch.no_grad():
         gaussians.log_scales.fill_(math.log(0.001))
-    most = schedule.config.density.bound(0)
-    return gaussians, with_moments(gaussians, schedule), GradientStrategy.start(schedule, most, EXTENT, count, 5, False)
+    most, cameras = schedule.config.density.bound(0), [camera_at(distance) for distance in (4.0, 8.0)]
+    control = GradientStrategy.start(schedule, most, EXTENT, count, cameras, False)
+    return gaussians, with_moments(gaussians, schedule), control
+
+
+def camera_at(distance: float) -> Camera:
+    """A camera that looks at the origin, with pixels of a hundredth of the distance."""
+    return Camera(
+        100.0, 100.0, 40.0, 30.0, 80, 60, look_at(np.array([0, 0, -distance]), np.zeros(3), np.array([0, -1.0, 0]))
+    )
 
 
 def _schedule(**changes: Any) -> Schedule:
@@ -147,6 +158,16 @@ def test_gaussians_that_no_image_shows_are_removed() -> None:
     assert len(gaussians) == 3
 
 
+def test_gaussians_far_smaller_than_a_pixel_are_removed() -> None:
+    """At the origin the nearer camera has pixels of 0.04."""
+    gaussians, surgery, control = _setup(prune_subpixel=0.1)
+    with torch.no_grad():
+        gaussians.means[:] = 0.0
+        gaussians.log_scales[:, 0] = torch.tensor([0.003, 0.0039, 0.0041, 0.01, 0.1, 0.2]).log()
+    assert control.densify(surgery, 4).pruned == 2
+    assert len(gaussians) == 4
+
+
 def test_a_growing_window_may_hide_gaussians() -> None:
     for is_rig, pruned in ((False, 0), (True, 6)):
         _, surgery, control = _setup(prune_unseen_passes=1.5, window_full_fraction=0.9, refine_every_fraction=0.0)
@@ -154,7 +175,7 @@ def test_a_growing_window_may_hide_gaussians() -> None:
         for _ in range(2 * MIN_PATIENCE):
             control.accumulate(_screen(torch.zeros(6, 2)), 2, 2, False)
             control.after_step(surgery, range(12, 13))
-        assert int(control._hidden(surgery.gaussians).sum()) == 0
+        assert int(control._hidden(surgery.gaussians, torch.ones(6)).sum()) == 0
         assert int((control.unseen > control.patience).sum()) == pruned
 
 
