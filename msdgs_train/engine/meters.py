@@ -10,7 +10,7 @@ from torch.nn.utils import get_total_norm
 from msdgs_serve.scene.errors import MsdgsError
 
 MAX_SKIPPED_IN_A_ROW = 20
-SMOOTHING = 0.98  # of the reported loss and PSNR: a moving average over about 50 steps
+SMOOTHING = 0.98  # of the reported loss and PSNR: a moving average over about 50 steps, or over all of fewer
 
 
 class TrainingDiverged(MsdgsError):
@@ -30,6 +30,7 @@ class StepMeter:
     def __init__(self) -> None:
         self.skipped = self.skipped_in_a_row = 0
         self.averages: tuple[float, float] | None = None  # loss, squared error
+        self.weight = 0.0  # of all steps in the averages: 1 - SMOOTHING**steps
 
     def accept(
         self, step: int, observed: Observed, gradients: Sequence[Tensor], optimizer: torch.optim.Optimizer
@@ -45,16 +46,18 @@ class StepMeter:
             return False
         self.skipped_in_a_row = 0
         error = sum(error.item() for error in observed.squared_errors) / len(losses)
-        old = self.averages or (loss, error)
-        self.averages = SMOOTHING * old[0] + (1 - SMOOTHING) * loss, SMOOTHING * old[1] + (1 - SMOOTHING) * error
+        old, self.weight = self.averages or (loss, error), SMOOTHING * self.weight + 1 - SMOOTHING
+        rate = (1 - SMOOTHING) / self.weight
+        self.averages = old[0] + rate * (loss - old[0]), old[1] + rate * (error - old[1])
         return True
 
     def read(self) -> None:
         """Bring the numbers up to date."""
 
-    def load(self, skipped: int, in_a_row: int, averages: tuple[float, float] | None) -> None:
+    def load(self, skipped: int, in_a_row: int, averages: tuple[float, float] | None, weight: float) -> None:
         """Continue from such numbers."""
         self.skipped, self.skipped_in_a_row, self.averages = skipped, in_a_row, averages
+        self.weight = 0.0 if averages is None else weight
 
     def check(self, step: int) -> None:
         """Raise `TrainingDiverged` if the numbers, of steps up to this one, say so."""
@@ -71,7 +74,7 @@ class DeviceMeter(StepMeter):
         super().__init__()
         self._device = device
         self._counts = self._means = torch.empty(0)
-        self.load(0, 0, None)
+        self.load(0, 0, None, 0.0)
 
     def accept(
         self, step: int, observed: Observed, gradients: Sequence[Tensor], optimizer: torch.optim.Optimizer
@@ -82,16 +85,18 @@ class DeviceMeter(StepMeter):
         optimizer.found_inf = broken.float()  # type: ignore[attr-defined]
         skipped, in_a_row = self._counts.unbind()
         self._counts = torch.stack([skipped + broken, (in_a_row + 1) * broken])
-        smoothed = torch.where(self._means.isnan(), new, torch.lerp(new, self._means, SMOOTHING))
+        old, weight = self._means[:2], SMOOTHING * self._means[2:] + 1 - SMOOTHING
+        smoothed = torch.cat([old + (1 - SMOOTHING) / weight * (new - old), weight])
         self._means = torch.where(broken, self._means, smoothed)
         return True
 
     def read(self) -> None:
         self.skipped, self.skipped_in_a_row = map(int, self._counts.tolist())
-        loss, error = self._means.tolist()
-        self.averages = None if loss != loss else (loss, error)  # NaN before the first
+        loss, error, self.weight = self._means.tolist()
+        self.averages = (loss, error) if self.weight else None
 
-    def load(self, skipped: int, in_a_row: int, averages: tuple[float, float] | None) -> None:
-        super().load(skipped, in_a_row, averages)
+    def load(self, skipped: int, in_a_row: int, averages: tuple[float, float] | None, weight: float) -> None:
+        super().load(skipped, in_a_row, averages, weight)
         self._counts = torch.tensor([skipped, in_a_row], device=self._device)
-        self._means = torch.tensor(averages or (torch.nan, torch.nan), device=self._device)
+        means = [*(averages or (0.0, 0.0)), self.weight]
+        self._means = torch.tensor(means, dtype=torch.float64, device=self._device)

@@ -157,6 +157,7 @@ class Trainer:
             "skipped": (self._meter.skipped, self._meter.skipped_in_a_row),
             "rollbacks": self.rollbacks,
             "averages": self._meter.averages,
+            "averages_weight": self._meter.weight,
             "generators": [generator.get_state() for generator in self._generators()],
             "curriculum": self._curriculum.order,
             "system": self.system.state(),
@@ -187,7 +188,7 @@ class Trainer:
         if checkpoint.exists():
             self.load_checkpoint(checkpoint)
         self.rollbacks = rollbacks
-        self._meter.load(skipped, 0, self._meter.averages)
+        self._meter.load(skipped, 0, self._meter.averages, self._meter.weight)
         self._generator.manual_seed(self.config.run.seed + ROLLBACK_SEED * rollbacks)
         self._curriculum.order = torch.empty(0, dtype=torch.int64)
 
@@ -201,7 +202,8 @@ class Trainer:
         if any(index >= len(self.scene.splits["train"]) for index in self._curriculum.order):
             raise LookupError("an image that this dataset doesn't have")
         skipped, in_a_row = state["skipped"]
-        self._meter.load(skipped, in_a_row, state["averages"])
+        weight = state.get("averages_weight", 1.0)  # checkpoints of earlier versions lack it
+        self._meter.load(skipped, in_a_row, state["averages"], weight)
         self.rollbacks = state["rollbacks"]
         for generator, stored in zip(self._generators(), state["generators"], strict=True):
             generator.set_state(stored)

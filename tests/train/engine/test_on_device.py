@@ -16,7 +16,14 @@ from msdgs_train.datasets import SceneData, load_scene
 from msdgs_train.datasets.cache import ImageCache
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.engine.masked_adam import MaskedAdam
-from msdgs_train.engine.meters import MAX_SKIPPED_IN_A_ROW, DeviceMeter, Observed, StepMeter, TrainingDiverged
+from msdgs_train.engine.meters import (
+    MAX_SKIPPED_IN_A_ROW,
+    SMOOTHING,
+    DeviceMeter,
+    Observed,
+    StepMeter,
+    TrainingDiverged,
+)
 from msdgs_train.engine.run import fit
 from msdgs_train.engine.trainer import Trainer
 from msdgs_train.gaussians.model import DynamicGaussians
@@ -204,12 +211,15 @@ def test_meters_agree_and_broken_steps_change_nothing() -> None:
         (StepMeter(), DeviceMeter("cpu")),
         [torch.optim.Adam(m.parameters(), fused=True) for m in models],
     )
+    kept = []
     for step in range(1, 12):
         broken = step in (3, 4, 9)
         grads = [torch.randn(p.shape, generator=generator) for p in models[0].parameters()]
         losses = torch.rand(2, generator=generator)
         if broken:
             (grads[0] if step == 3 else losses)[0] = torch.nan
+        else:
+            kept.append(float(losses.double().mean()))
         for model, meter, optimizer in zip(models, meters, optimizers, strict=True):
             for parameter, grad in zip(model.parameters(), grads, strict=True):
                 parameter.grad = grad.clone()
@@ -220,6 +230,9 @@ def test_meters_agree_and_broken_steps_change_nothing() -> None:
         counts = [(meter.skipped, meter.skipped_in_a_row) for meter in meters]
         assert counts[0] == counts[1] == (sum(k <= step for k in (3, 4, 9)), {3: 1, 4: 2, 9: 1}.get(step, 0))
         assert_close(np.array(meters[1].averages), np.array(meters[0].averages), "float32.relative")
+    weights = SMOOTHING ** np.arange(len(kept))[::-1]
+    average = np.average(kept, weights=weights)
+    assert_close(np.array(meters[0].averages), np.array([average, average / 2]), "float32.relative")
     for one, other in zip(*(o.state_dict()["state"].values() for o in optimizers), strict=True):
         assert all(torch.equal(one[name], other[name]) for name in one)
     assert all(map(torch.equal, models[0].parameters(), models[1].parameters()))
