@@ -1,8 +1,9 @@
 """The numbers in the names of images, as fields that all names have.
 
-A number is an integer, a decimal (`t_0.25`), a date with or without a clock (`IMG_20240131_235958_123`), a clock
-(`00-01-02.500`), a time in units (`1m02s500ms`) or an epoch (`1706745600123`). All names decide together: a form that
-doesn't fit all of them, or that would join a grid of two numbers (`cam1.0001`), is read as separate numbers.
+A number is an integer, a decimal (`t_0.25`, `t0p25`, `t_2.5e-05`), a date with or without a clock
+(`IMG_20240131_235958_123`), a clock (`00-01-02.500`), a time in units (`59s` beside `1m02s500ms`) or an epoch
+(`1706745600123`). All names decide together: a form that doesn't fit all of them, or that would join a grid of two
+numbers (`cam1.0001`), is read as separate numbers.
 """
 
 import itertools
@@ -27,23 +28,34 @@ MINUTES = rf"{HOUR}[-_.:h]?{SIXTY}"
 TO_MINUTES_OR_MORE = rf"(?:{AFTER_DATE.format('colon2')}(?:[.,]\d+)?|{MINUTES})"
 SUBSECOND = r"(?:\d{9}|\d{6}|\d{3})(?!\d)"
 HALF_DAY = r"(?:\s?[AaPp][Mm]\b)?"
-UNITS = r"(?:(?P<h>\d+)h)?(?:(?P<m>\d+)m)?(?P<s>\d+(?:[.,]\d+)?)s(?:(?P<f>\d{3})(?!\d)|(?P<ms>\d+)ms)?"
+SECONDS = r"\d+(?:[.,]\d+)?"
+UNITS = (
+    rf"(?:(?P<h>\d+)h)?(?:(?P<m>\d+)m(?!s))?(?:(?P<s>{SECONDS})s)?"
+    r"(?:(?P<ms>\d+)ms|(?<=s)(?P<f>\d{3}))?(?![A-Za-z\d])"
+)
 DAY = 86_400
 """Seconds."""
-SIGN = r"(?:(?:(?<![\w.)-])|(?<=_))-)?"
+MINUS = "\u2212-"
+SIGNS = f"+{MINUS}"
+SIGN = rf"(?:(?:(?<![\w.){MINUS}])|(?<=_))[{SIGNS}])?"
 FORMS = {
     "stamp_fraction": rf"{DATE.format('dash1')}{BETWEEN}{AFTER_DATE.format('colon1')}[-_s]?{SUBSECOND}",
     "stamp": rf"{DATE.format('dash2')}(?:{BETWEEN}{TO_MINUTES_OR_MORE}{HALF_DAY})?(?!\d)",
     "epoch": r"(?<!\d)1\d{9}(?:\d{9}|\d{6}|\d{3})?(?!\d)(?:\.\d+|[-_]\d{9}(?!\d))?",
     "clock": rf"(?<!\d)(?!\d+_\d){CLOCK.format('colon3')}(?:[.,]\d+|s{SUBSECOND})?{HALF_DAY}(?!\d)",
-    "units": rf"(?<!\d)(?:(?=\d+[hm]\d|\d+s\d){UNITS}|\d+ms)(?![A-Za-z])",
+    "units": rf"(?<!\d)(?=\d+[hm]{SECONDS}m?[hms]|{SECONDS}s\d|\d+ms){UNITS}",
+    "unit": rf"(?<!\d)(?:\d+[hm]|{SECONDS}s)(?![A-Za-z\d])",
+    "scientific": rf"{SIGN}{SECONDS}[eE][-+]\d{{2,3}}(?!\d)",
+    "point": rf"{SIGN}\d+pt?\d+(?![A-Za-z])",
     "decimal": rf"{SIGN}\d+[.,]\d+",
     "number": rf"{SIGN}\d+",
 }
 """A pattern for each form of a number; the first that matches counts."""
 
-MIXABLE = ({"stamp_fraction", "stamp"}, {"decimal", "number"})
-STAMPS = {"stamp_fraction", "stamp", "epoch", "clock", "units"}
+DECIMALS = {"scientific", "point", "decimal"}
+MERE = {*DECIMALS, "number"}
+MIXABLE = ({"stamp_fraction", "stamp"}, {"units", "unit"}, MERE)
+STAMPS = {"stamp_fraction", "stamp", "epoch", "clock", "units", "unit"}
 CAMERA_WORDS = re.compile(r"(?:.*cam|.*camera|view|gopro|kinect|sensor|lens|device|c)s?")
 FRAME_WORDS = re.compile(r"(?:.*frame|frm|fr|f)s?")
 TIME_WORDS = re.compile(r"(?:.*time|.*timestamp|ts|t|sec|second|ms)s?")
@@ -101,7 +113,7 @@ def read_fields(names: Sequence[str], *, may_separate: bool = True) -> list[Fiel
     forms = list(FORMS)
     uneven = _uneven([_components(name, ["number"]) for name in names])
     while True:
-        rows = [_components(name, forms) for name in names]
+        rows = _with_signs([_components(name, forms) for name in names])
         rows = _without_separators(rows) if may_separate else rows
         fields = list(_fields(rows))
         unsound = [_first_form(row[place].tokens for row in rows) for place in _uneven(rows) - uneven]
@@ -143,18 +155,37 @@ def _component(text: str, finder: re.Pattern[str]) -> Component:
     return Component((*texts, text[end:]), tuple(tokens))
 
 
+def _with_signs(rows: list[list[Component]]) -> list[list[Component]]:
+    """With signs in numbers, where the same text without one, or with another, is before others (`frame-1`, `frame0`)
+    in the same place."""
+    places = [(place - len(row), each) for row in rows for place, each in enumerate(row)]
+    before = {(place, i, text) for place, each in places for i, text in enumerate(each.texts)}
+
+    def signed(place: int, component: Component) -> Component:
+        texts, tokens = list(component.texts), list(component.tokens)
+        for i, (text, token) in enumerate(zip(component.texts, component.tokens, strict=False)):
+            stem, sign = text[:-1], text[-1:]
+            others = [stem, *(stem + other for other in SIGNS if other != sign)]
+            if sign and sign in SIGNS and token.form in MERE and any((place, i, each) in before for each in others):
+                texts[i], factor = stem, -1 if sign in MINUS else 1
+                tokens[i] = Token(sign + token.text, token.form, tuple(factor * part for part in token.parts))
+        return Component(tuple(texts), tuple(tokens))
+
+    return [[signed(place - len(row), each) for place, each in enumerate(row)] for row in rows]
+
+
 def _without_separators(rows: list[list[Component]]) -> list[list[Component]]:
     """With hyphens in the texts before the numbers, where all after such a text have one; after `=` they are minus."""
     after = [
         (text, token) for row in rows for each in row for text, token in zip(each.texts, each.tokens, strict=False)
     ]
-    signed = {text for text, token in after if not token.text.startswith("-") or text.endswith("=")}
+    signed = {text for text, token in after if not token.text.startswith(tuple(MINUS)) or text.endswith("=")}
 
     def unsigned(component: Component) -> Component:
         texts, tokens = list(component.texts), list(component.tokens)
         for index, (text, token) in enumerate(zip(component.texts, component.tokens, strict=False)):
             if text not in signed:
-                texts[index] = f"{text}-"
+                texts[index] = text + token.text[0]
                 tokens[index] = Token(token.text[1:], token.form, tuple(-part for part in token.parts))
         return Component(tuple(texts), tuple(tokens))
 
@@ -162,14 +193,11 @@ def _without_separators(rows: list[list[Component]]) -> list[list[Component]]:
 
 
 def _parts(form: str, text: str) -> tuple[Number, ...]:
-    if form in ("decimal", "number"):
-        whole, _, fraction = text.replace(",", ".").partition(".")
-        sign = "-" * text.startswith("-")
-        return (int(whole), *([Fraction(f"{sign}0.{fraction}")] if fraction else []))
-    if form == "units":
-        found = re.fullmatch(UNITS, text)
-        if found is None:  # milliseconds alone
-            return (Fraction(int(text.removesuffix("ms")), 1000),)
+    if form in MERE:
+        number = Fraction(re.sub(r"pt?|,", ".", text.replace(MINUS[0], "-")))
+        whole = int(number)
+        return (whole,) if form == "number" else (whole, number - whole)
+    if form in ("units", "unit") and (found := re.fullmatch(UNITS, text)):
         hours, minutes, seconds = (Fraction(found[unit].replace(",", ".")) if found[unit] else 0 for unit in "hms")
         return 3600 * hours + 60 * minutes + seconds, Fraction(int(found["f"] or found["ms"] or 0), 1000)
     digits = re.sub(r"\D", "", re.sub(r"(?<!\d)\d(?=[-_.:]\d\d[-_.:]\d\d)", r"0\g<0>", text))
@@ -268,10 +296,12 @@ def _unsound_form(field: Field) -> str | None:
         return form
     if form == "clock" and all(re.match(r"00\d{4}", token.text) for token in field.tokens):  # a number of six digits
         return form
-    if form == "decimal":
+    if form == "unit" and len({token.text[-1] for token in field.tokens}) == 1:  # a mere number
+        return form if len(set(field.values)) > 1 else None
+    if form in ("point", "decimal"):
         if field.is_called(TIME_WORDS) or field.is_called(FRAME_WORDS):
             return None
-        fractions = [re.sub(r"-?\d+[.,]?", "", token.text, count=1) for token in field.tokens]
+        fractions = [re.sub(r"\D?\d+\D*", "", token.text, count=1) for token in field.tokens]
         counts_on = len(set(map(len, fractions))) > 1 and any(len(f) > 1 and f.endswith("0") for f in fractions)
         if counts_on or field.is_called(CAMERA_WORDS):  # take.9, take.10; cam1.0001
             return form

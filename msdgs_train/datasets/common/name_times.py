@@ -11,10 +11,10 @@ from fractions import Fraction
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-from msdgs_train.datasets.common.hexadecimal import as_decimal
 from msdgs_train.datasets.common.name_fields import (
     CAMERA_WORDS,
     DAY,
+    DECIMALS,
     EXTENSION,
     FRAME_WORDS,
     TIME_WORDS,
@@ -25,6 +25,7 @@ from msdgs_train.datasets.common.name_fields import (
     read_fields,
     read_values,
 )
+from msdgs_train.datasets.common.name_spellings import plain
 
 PHOTO_WORDS = re.compile(r"img|dsc[nf]?|mg|imgp|sam|dji|gopr|photo|pict?")
 """Words before the numbers that a camera gives to its photos."""
@@ -55,8 +56,7 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
     `poses` are equal for images taken from the same place, `lenses` for those that may be of the same camera. Raises
     `NameWithoutTime`.
     """
-    decimal = as_decimal(names)
-    everywhere = read_fields(decimal)
+    everywhere = read_fields(plain(names))
     if not everywhere and len(names) > 1:
         raise NameWithoutTime(next((name for name in names if not re.search(r"\d[^/]*$", name)), names[0]))
     fields = _dated([field for field in everywhere if len(set(field.values)) > 1])
@@ -85,7 +85,7 @@ def readings(names: Sequence[str], poses: Sequence[Hashable], lenses: Sequence[H
 
 def times_in_order(names: Sequence[str]) -> Times:
     """The place of each file's name in their natural order; those that differ in the folder alone share a place."""
-    files = [EXTENSION.sub("", name.rsplit("/", 1)[-1]) for name in as_decimal(names)]
+    files = [EXTENSION.sub("", name.rsplit("/", 1)[-1]) for name in plain(names)]
     places = {file: place for place, file in enumerate(sorted(set(files), key=natural_order))}
     return tuple(places[file] for file in files)
 
@@ -94,7 +94,7 @@ def times_by_pattern(names: Sequence[str], expression: re.Pattern[str]) -> Times
     """The numbers, dates and clocks that `time_group` finds. Raises `NameWithoutTime`."""
     found = [expression.search(name) for name in names]
     group = time_group(expression)
-    times = read_values([match[group] or "" if match and group else "" for match in found])
+    times = read_values(plain([match[group] or "" if match and group else "" for match in found]))
     for name, time in zip(names, times, strict=True):
         if time is None:
             raise NameWithoutTime(name)
@@ -205,7 +205,7 @@ def _reading(names: Sequence[str], field: Field) -> Reading:
     texts = tuple(token.text for token in field.tokens)
     pattern = field.pattern if field.pattern and _finds(field.pattern, names, texts) else None
     called = "camera" if field.is_called(CAMERA_WORDS) else "photo" if field.is_called(PHOTO_WORDS) else None
-    is_decimal = any(token.form == "decimal" for token in field.tokens) and not field.is_called(FRAME_WORDS)
+    is_decimal = any(token.form in DECIMALS for token in field.tokens) and not field.is_called(FRAME_WORDS)
     is_in_seconds = field.is_stamp or field.is_called(SECOND_WORDS) or is_decimal
     return Reading(times, texts, pattern, called, is_in_seconds)
 

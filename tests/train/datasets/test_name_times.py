@@ -37,7 +37,14 @@ def clock(seconds: int, form: str, hour: int = 23, minute: int = 59) -> str:
     total = hour * 3600 + minute * 60 + seconds
     days, rest = divmod(total, 86400)
     year, month, day = ((2023, 12, 31), (2024, 1, 1))[days]
-    values = {"H": rest // 3600, "h": (rest // 3600 + 11) % 12 + 1, "M": rest // 60 % 60, "S": rest % 60}
+    month_name = {12: "Dec", 1: "January"}[month]
+    values = {
+        "b": month_name,
+        "H": rest // 3600,
+        "h": (rest // 3600 + 11) % 12 + 1,
+        "M": rest // 60 % 60,
+        "S": rest % 60,
+    }
     return form.format(Y=year, m=month, d=day, p="PM" if rest // 3600 >= 12 else "AM", **values)
 
 
@@ -71,6 +78,21 @@ ONE_CAMERA: dict[str, Callable[[int], str]] = {
     "minutes and seconds": lambda i: f"clip_{(50 + i) // 60}m{(50 + i) % 60}s",
     "below 0": lambda i: f"t_{i - 5}",
     "decimals below 0": lambda i: f"t=-{(FRAMES - i) / 8}",
+    "signed": lambda i: f"t_{i / 4 - 1:+.2f}",
+    "signed after a letter": lambda i: f"frame{i - 5:+03}",
+    "below 0 after a letter": lambda i: f"frame{i - 5}",
+    "below 0 after a hyphen": lambda i: f"frame-{i - 5}",
+    "minus of typography": lambda i: f"t_{i - 5}".replace("-", "\u2212"),
+    "exponents": lambda i: f"t_{2.5e-05 * i}",
+    "p for the point": lambda i: f"t{i // 2}p{i % 2 * 5}",
+    "pt for the point": lambda i: f"run3_{i // 2}pt{i % 2 * 5}",
+    "seconds, then minutes": lambda i: f"{f'{(50 + i) // 60}m' * (i > 9)}{(50 + i) % 60:02}s",
+    "minutes, then hours": lambda i: f"clip_{50 + i}m" if i < 10 else f"clip_1h{i - 10:02}m",
+    "milliseconds, then seconds": lambda i: (
+        f"{i * 125}ms" if i < 8 else f"{i // 8}s{i % 8 * 125}ms".replace("s0ms", "s")
+    ),
+    "numbered copies": lambda i: f"IMG_1234{f' ({i})' * (i > 0)}",
+    "days with names of months": lambda i: f"{10 + i}Jan2024",
     "dots are no decimals": lambda i: f"shot010.{1 + i}",
     "milliseconds since 1970": lambda i: f"{1706745599600 + 100 * i}",
     "nanoseconds since 1970": lambda i: f"{1706745599600000000 + 100 * i}",
@@ -116,6 +138,10 @@ CLOCKS = (
     "cam_{H:02}{M:02}{S:02}_x2",
     "{d:02}-{m:02}-{Y}_{H:02}-{M:02}-{S:02}",
     "{d:02}.{m:02}.{Y} {H:02}.{M:02}.{S:02}",
+    "IMG{d:02}{b}{Y}_{H:02}{M:02}{S:02}",
+    "{Y}-{b}-{d}_{H:02}-{M:02}-{S:02}",
+    "{b} {d}, {Y} at {h}.{M:02}.{S:02} {p}",
+    "{d}{b}{Y}{H:02}{M:02}{S:02}",
     "DJI_{Y}{m:02}{d:02}{H:02}{M:02}{S:02}_0001_V",
     "{H:02}-{M:02}-{S:02}",
     "{H:02}h{M:02}m{S:02}s",
