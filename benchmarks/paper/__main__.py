@@ -17,7 +17,7 @@ from msdgs_serve.scene.errors import InvalidInput, MsdgsError
 from msdgs_serve.writing import in_words, write_text
 from msdgs_train.cli.compare import comparison_progress
 from msdgs_train.cli.console import console
-from msdgs_train.comparison.scenes import Scene
+from msdgs_train.comparison.scenes import Scene, require_folders
 from msdgs_train.engine.schedule import Schedule
 from msdgs_train.layers.parts import to_text
 from msdgs_train.settings import Flag, optional
@@ -92,6 +92,7 @@ class Paper:
         scenes = find_scenes(table, self.data)
         require_known("methods", self.methods, [method.name for method in table.methods])
         require_known("scenes", self.scenes, [scene.name for scene in scenes])
+        require_folders([scene for scene in scenes if scene.name in self.scenes or not self.scenes])
         trained = read_systems(table, scenes, self.budget, small=self.small)
         csv = self.csv or self.out / "paper.csv"
         runs = runs_of(trained, scenes, self.seeds, self.out)

@@ -17,6 +17,7 @@ from msdgs_train.engine.config import TrainConfig
 from msdgs_train.layers.parts import to_text
 
 NONE = "–"
+OVERTIME = 1.05
 MAX_GAP = 1.0  # dB; larger ones need a cause
 EMBEDDING_SIZE, NETWORK_SIZE = 32, 1_155  # of the paper's modulation, numbers a Gaussian and of the network
 VARIANTS = {
@@ -125,8 +126,17 @@ def _conditions(results: Results) -> Iterator[str]:
             yield (
                 f"{scene.name}: every {every}th training image is held out as test, and those halfway between as val."
             )
-    if rows and not any(row["test_lpips"] or row["val_lpips"] for row in rows):
-        yield "LPIPS wasn't measured: its package or the weights of its network weren't there."
+    if without := [row for row in rows if not (row["test_lpips"] or row["val_lpips"])]:
+        which = "" if len(without) == len(rows) else f" in {len(without)} run(s)"
+        yield f"LPIPS wasn't measured{which}: its package or the weights of its network weren't there."
+    if over := [
+        row for row in rows if row["minutes"] and float(row["seconds"]) > OVERTIME * 60 * float(row["minutes"])
+    ]:
+        systems = " and ".join(dict.fromkeys(row["system"] for row in over))
+        yield (
+            f"{len(over)} run(s) of {systems} took longer than their minutes: a quarter of the time is "
+            "kept for the last evaluation, and held-out images of a volume may take more (Runs, below)."
+        )
 
 
 def _numbers(results: Results, heading: str, column: str, digits: int, published: int | None) -> Section:

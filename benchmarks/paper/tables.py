@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from benchmarks.paper.recipes import Recipe, recipe, scene_recipes
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.matrix import Budget, Run, make_runs, read_system
-from msdgs_train.comparison.scenes import Scene, read_scenes
+from msdgs_train.comparison.scenes import Scene, all_scenes
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.settings import optional
 
@@ -72,9 +72,10 @@ def read_table(name: str) -> Table:
 
 
 def find_scenes(table: Table, sources: Sequence[Path]) -> list[Scene]:
-    """The scenes of TOML files, of datasets, and of folders with the table's scenes in them, which have its names.
+    """The scenes of TOML files, of datasets, and of folders with the table's scenes in them, which have its names;
+    their folders may be missing.
 
-    Raises `InvalidInput` naming what is missing.
+    Raises `InvalidInput` naming what is invalid.
     """
     if not sources:
         raise InvalidInput("data", f"the folder of {table.dataset}, datasets or TOML files of scenes", "none")
@@ -83,7 +84,7 @@ def find_scenes(table: Table, sources: Sequence[Path]) -> list[Scene]:
     for source in sources:
         inside = sorted(source.iterdir()) if source.is_dir() else []
         folders += [folder for folder in inside if folder.is_dir() and _plain(folder.name) in spelled] or [source]
-    return [replace(scene, name=spelled.get(_plain(scene.name), scene.name)) for scene in read_scenes(folders)]
+    return [replace(scene, name=spelled.get(_plain(scene.name), scene.name)) for scene in all_scenes(folders)]
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,9 @@ the PSNR of each image, in order; `*_moving_psnr` only where the region is known
 moving average of the last steps. `best_*` are of the best evaluation during training, by the PSNR of a split, and
 `dataset` is a digest of its images, times and cameras; rows of earlier versions lack them."""
 
+TEXTS = {"date", "machine", "scene", "system", "time", "settings", "best_split", DATASET}
+"""Columns that aren't numbers."""
+
 Row = dict[str, str]
 
 
@@ -59,19 +62,37 @@ def key_of_row(row: Row) -> tuple[str, ...]:
 def read_rows(path: Path) -> list[Row]:
     """The rows of a CSV file; none if there is no such file. `BEST` and `DATASET` are empty where columns are missing.
 
-    Raises `InvalidInput` if it has other columns.
+    Raises `InvalidInput` if it has other columns, or naming a line that is incomplete or whose numbers are none.
     """
     if not path.exists():
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) not in (COLUMNS, COLUMNS[:-1], COLUMNS[: -1 - len(BEST)]):
-            raise InvalidInput("csv", f"a file with the columns {', '.join(COLUMNS)}", path)
-        return [dict.fromkeys((*BEST, DATASET), "") | row for row in reader]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            columns = tuple(reader.fieldnames or ())
+            if columns not in (COLUMNS, COLUMNS[:-1], COLUMNS[: -1 - len(BEST)]):
+                raise InvalidInput("csv", f"a file with the columns {', '.join(COLUMNS)}", path)
+            rows = []
+            for row in reader:
+                _require_sound(row, f"line {reader.line_num} of {path}")
+                rows.append(dict.fromkeys((*BEST, DATASET), "") | row)
+            return rows
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInput("csv", f"a CSV file in UTF-8 ({error})", path) from error
+
+
+def _require_sound(row: dict[Any, Any], place: str) -> None:
+    if None in row or None in row.values():
+        raise InvalidInput("csv", "made of complete lines; remove those that aren't", place)
+    for name in (name for name in row if name not in TEXTS):
+        try:
+            [float(number) for number in row[name].split()]
+        except ValueError:
+            raise InvalidInput("csv", f"made of numbers in the column {name}", f"{row[name]!r} in {place}") from None
 
 
 def append_row(path: Path, row: Row) -> None:
-    """Add a row, atomically, also while other processes add theirs."""
+    """Add a row, atomically, also while other processes add theirs; if another one has added this run, it stays."""
     path.parent.mkdir(parents=True, exist_ok=True)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
@@ -79,8 +100,10 @@ def append_row(path: Path, row: Row) -> None:
         text = io.StringIO()
         writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
         writer.writeheader()
-        writer.writerows([*read_rows(path), row])
-        write_text(path, text.getvalue())
+        rows = read_rows(path)
+        if key_of_row(row) not in map(key_of_row, rows):
+            writer.writerows([*rows, row])
+            write_text(path, text.getvalue())
     finally:
         os.close(folder)
 

@@ -29,17 +29,28 @@ def read_scenes(sources: Sequence[Path], names: Sequence[str] = ()) -> list[Scen
     Each table of a file is a scene: its `folder`, relative to the file, and optionally `size`, `llffhold`, `time_from`
     and `splits`. Raises `InvalidInput` naming what is unknown, invalid or missing.
     """
-    scenes = [scene for source in sources for scene in _scenes(source)]
-    require_unique("scene", (scene.name for scene in scenes))
+    scenes = all_scenes(sources)
     known = [scene.name for scene in scenes]
     unknown = [name for name in names if name not in known]
     if unknown:
         raise InvalidInput("scenes", f"of {', '.join(known)}", unknown[0])
     chosen = [scene for scene in scenes if scene.name in names or not names]
-    missing = dict.fromkeys(str(scene.folder) for scene in chosen if not scene.folder.is_dir())
+    require_folders(chosen)
+    return chosen
+
+
+def all_scenes(sources: Sequence[Path]) -> list[Scene]:
+    """The same, of all names, whether or not there are their folders."""
+    scenes = [scene for source in sources for scene in _scenes(source)]
+    require_unique("scene", (scene.name for scene in scenes))
+    return scenes
+
+
+def require_folders(scenes: Sequence[Scene]) -> None:
+    """Raise `InvalidInput` naming the folders of scenes that are missing."""
+    missing = dict.fromkeys(str(scene.folder) for scene in scenes if not scene.folder.is_dir())
     if missing:
         raise InvalidInput("data", "folders of datasets", f"no folder {', '.join(missing)}")
-    return chosen
 
 
 def _scenes(source: Path) -> list[Scene]:

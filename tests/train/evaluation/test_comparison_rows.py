@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -300,6 +301,8 @@ def test_rows_of_several_comparisons_are_kept(tmp_path: Path) -> None:
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda seed: append_row(path, row("s", "a", seed, [1.0])), range(40)))
     assert sorted(int(found["seed"]) for found in read_rows(path)) == list(range(40))
+    append_row(path, row("s", "a", 7, [2.0]))
+    assert len(read_rows(path)) == 40, "a run that has a row"
 
 
 @pytest.mark.parametrize("later", [(DATASET,), (*BEST, DATASET)])
@@ -323,4 +326,27 @@ def test_a_csv_file_of_other_columns_is_refused(tmp_path: Path) -> None:
         assert len(list(csv.reader(file))) == 2
     path.write_text("scene,system\n")
     with pytest.raises(InvalidInput, match="columns"):
+        read_rows(path)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda line: line[:-9], "complete lines; remove those that aren't, got line 3 of"),
+        (lambda line: line + b",1", "complete lines; remove those that aren't, got line 3 of"),
+        (lambda line: line.replace(b",20,", b",abc,"), "numbers in the column val_psnr, got 'abc' in line 3 of"),
+        (lambda line: line.replace(b"1.00", b"1,00"), "complete lines"),
+        (lambda line: line.replace(b"2026", b"\xff\xfe"), "UTF-8"),
+    ],
+    ids=["cut", "longer", "no number", "comma", "no text"],
+)
+def test_a_damaged_csv_file_is_refused_by_line(damage: Callable[[bytes], bytes], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "rows.csv"
+    for seed in range(3):
+        append_row(path, row("s", "a", seed, [1.0, 2.0]))
+    assert len(read_rows(path)) == 3
+    lines = path.read_bytes().splitlines(keepends=True)
+    lines[2] = damage(lines[2].rstrip()) + b"\n"
+    path.write_bytes(b"".join(lines))
+    with pytest.raises(InvalidInput, match=message):
         read_rows(path)

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.paper.__main__ import Paper
 from benchmarks.paper.page import Results, sections
-from benchmarks.paper.tables import Method, PaperBudget, Trained, read_systems, read_table, runs_of
+from benchmarks.paper.tables import Method, PaperBudget, Trained, find_scenes, read_systems, read_table, runs_of
+from msdgs_serve.process import EXIT_INVALID
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.comparison.rows import COLUMNS
 from msdgs_train.comparison.scenes import Scene
@@ -305,6 +307,39 @@ def test_the_mean_gain_is_that_of_all_scenes(tmp_path: Path) -> None:
 
     assert mean_gain(scenes) == "+1.00 (+1.00 to +1.00) / +2.59"
     assert mean_gain(scenes[:-1]) == "– / +2.59"
+
+
+def test_the_page_says_what_wasnt_measured_and_which_runs_took_longer(tmp_path: Path) -> None:
+    table, budget = read_table("table1"), PaperBudget(minutes=10, time="cpu")
+    scenes = [Scene("Hook", tmp_path, {})]
+    systems = read_systems(table, scenes, budget, small=True)
+    found = {"scene": "Hook", "seed": "0", "date": "2026-01-01", "machine": "any", "minutes": "10", "test_psnr": "20"}
+    rows = [
+        {**dict.fromkeys(COLUMNS, "0"), **found, "system": systems[name].system, "seconds": seconds, "best_split": ""}
+        | {"test_lpips": lpips, "val_lpips": "", "val_psnr": "", "test_images": "20"}
+        for name, seconds, lpips in (("TiNeuVox", "1111", ""), ("4DGS", "612", "0.1"))
+    ]
+
+    def conditions(of: list[dict[str, str]]) -> str:
+        runs = runs_of(systems, scenes, (0,), tmp_path)
+        return " ".join(next(sections(Results(table, systems, scenes, runs, of, budget, True))).notes)
+
+    assert "LPIPS wasn't measured in 1 run(s):" in conditions(rows)
+    assert "1 run(s) of tineuvox small took longer than their minutes" in conditions(rows)
+    assert "LPIPS wasn't measured: " in conditions(rows[:1])
+    assert not re.search("LPIPS|longer", conditions(rows[1:]))
+
+
+def test_scenes_that_arent_chosen_may_be_missing(tmp_path: Path) -> None:
+    (tmp_path / "scenes.toml").write_text('[one]\nfolder = "one"\n[two]\nfolder = "two"\n')
+    scenes = find_scenes(read_table("table1"), [tmp_path / "scenes.toml"])
+    assert [scene.name for scene in scenes] == ["one", "two"]
+    paper = Paper("table1", (tmp_path / "scenes.toml",), tmp_path / "out", methods=("DeformGS",), small=True)
+    with pytest.raises(InvalidInput, match=r"no folder .*one, .*two"):
+        paper.execute()
+    (tmp_path / "one").mkdir()
+    assert dataclasses.replace(paper, scenes=("one",)).execute() == EXIT_INVALID, "the run: the folder is empty"
+    assert (tmp_path / "out" / "table1.md").exists()
 
 
 def test_the_page_is_one_file() -> None:
