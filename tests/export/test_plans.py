@@ -14,9 +14,7 @@ import torch
 
 from msdgs_export.bake import Baked, bake
 from msdgs_export.jobs.verify import verify
-from msdgs_export.layers import HEAD_COLUMNS, LAYERS, ModelNotExportable
-from msdgs_export.layers.chain import summed_deltas
-from msdgs_export.layers.graph import GraphBuilder
+from msdgs_export.layers import LAYERS, ModelNotExportable
 from msdgs_export.measure.poses import in_float64
 from msdgs_export.measure.rendered_error import ExactFrames
 from msdgs_export.measure.times import times_to_verify
@@ -24,15 +22,13 @@ from msdgs_export.measure.views import cameras_of, evaluation_views
 from msdgs_export.plans.base import Plan
 from msdgs_export.plans.network import network
 from msdgs_export.plans.registry import PLANS, build, parse
-from msdgs_export.supports import SUPPORTS, SupportExport, SupportInputs
+from msdgs_export.supports import SUPPORTS
 from msdgs_export.trajectories.sampling import Trajectories
 from msdgs_serve.deformation import DeformationSession
 from msdgs_serve.rasterizer import GSPLAT
 from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.gaussians.model import DynamicGaussians
 from msdgs_train.layers.base import SceneBounds
-from msdgs_train.layers.chain import Deltas, MultiStepDeformation
-from msdgs_train.supports.base import CanonicalPoints, Support, SupportConfig
 from tests.support.models import BODIES, HASH4D, MLP, NODES, PLANE, SCENE, SPLINE, random_model
 from tests.support.tolerances import tolerance
 
@@ -202,49 +198,17 @@ def test_times_that_do_not_begin_at_0(tmp_path: Path, kind: str, plan: str, row:
     assert all(np.abs(a - b).max() <= tolerance(row) for a, b in poses)
 
 
-class RigidConfig(SupportConfig):
-    """Settings of a kind of support that the package doesn't have."""
-
-    kind = "rigid"
-
-    def build(self) -> "Rigid":
-        return Rigid()
-
-
-class Rigid(Support):
-    """All Gaussians move with the origin."""
-
-    kind = "rigid"
-    num_points = 1
-
-    def motions(
-        self, chain: MultiStepDeformation, means: torch.Tensor, t: torch.Tensor, num_layers: int | None = None
-    ) -> Deltas:
-        return chain(self.points(means), t, num_layers)
-
-    def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
-        parts = motions.means, motions.scales, motions.quats
-        means, scales, quats = (part.expand(len(gaussians.means), -1) for part in parts)
-        return Deltas(means, scales, quats)
-
-    def points(self, means: torch.Tensor) -> torch.Tensor:
-        return means.new_zeros(1, 3)
-
-
-class RigidExport(SupportExport):
-    def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
-        origin = graph.constant("rigid.origin", np.zeros((1, 3), np.float32))
-        return summed_deltas(graph, inputs.layers, origin, inputs.time, inputs.steps, list(HEAD_COLUMNS))
-
-
 def test_kinds_of_supports_and_layers_from_elsewhere_are_exported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    fourier = import_module("tests.support.plugin_example").FourierConfig(frequencies=2)
-    model = random_model(60, layers=(fourier, SLOW, COARSE), support=RigidConfig(), noise=0.02)
+    plugin = import_module("tests.support.plugin_example")
+    support, fourier = plugin.ConfinedConfig(radius=0.8), plugin.FourierConfig(frequencies=2)
+    model = random_model(60, layers=(fourier, SLOW, COARSE), support=support, noise=0.02)
     baked = bake(model, SCENE, "0" * 64)
-    with pytest.raises(ModelNotExportable, match="'rigid' can't be exported; those that can: gaussians, nodes"):
-        build("network", baked)
-    monkeypatch.setitem(SUPPORTS, "rigid", RigidExport())
+    assert 0 < int((model.gaussians.means.norm(dim=1) < 0.8).sum()) < 60
     check_against_model(opened(tmp_path / "scene.onnx", build("network", baked)), model)
+    with monkeypatch.context() as patch:
+        patch.delitem(SUPPORTS, "confined")
+        with pytest.raises(ModelNotExportable, match="'confined' can't be exported; those that can: gaussians, nodes"):
+            build("network", baked)
     monkeypatch.delitem(LAYERS, "fourier")
     with pytest.raises(ModelNotExportable, match="'fourier' can't be exported; those that can: mlp"):
         build("network", baked)

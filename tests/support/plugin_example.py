@@ -1,4 +1,4 @@
-"""A plugin: a layer kind, a system that trains with it, and the layer's export."""
+"""A plugin: a layer kind, a support, a system that trains with the layers, and the export of layers and support."""
 
 import copy
 import math
@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from msdgs_serve.scene.errors import InvalidInput
 from msdgs_train.datasets import Frame
 from msdgs_train.engine.config import TrainConfig
 from msdgs_train.gaussians.config import ModelConfig
@@ -21,9 +22,13 @@ from msdgs_train.layers.base import (
     SceneBounds,
     check_size,
 )
+from msdgs_train.layers.chain import Deltas
 from msdgs_train.layers.parameters import LearningRate, ParamGroup
 from msdgs_train.layers.registry import register_layer
 from msdgs_train.settings import SystemConfig
+from msdgs_train.supports.base import CanonicalPoints
+from msdgs_train.supports.gaussians import GaussiansConfig, GaussiansSupport
+from msdgs_train.supports.registry import register_support
 from msdgs_train.systems.base import Moment, Target, ViewLoss
 from msdgs_train.systems.gaussian_splatting import GaussianSplatting
 from msdgs_train.systems.registry import register_system
@@ -84,6 +89,38 @@ class FourierLayer(DeformationLayer):
 register_layer(FourierConfig)
 
 
+# support
+@dataclass(frozen=True)
+class ConfinedConfig(GaussiansConfig):
+    """Settings of motion in a ball around the origin."""
+
+    kind: ClassVar[str] = "confined"
+    radius: float = 1.0
+    """Radius of the ball outside of which nothing moves, in scene units."""
+
+    def build(self) -> "ConfinedSupport":
+        return ConfinedSupport(self)
+
+    def check(self, field: str) -> None:
+        if not self.radius > 0:
+            raise InvalidInput(f"{field}.radius", "above 0", self.radius)
+
+
+class ConfinedSupport(GaussiansSupport):
+    """Gaussians in the ball follow the layers, others stay where they are."""
+
+    kind = "confined"
+
+    def follow(self, gaussians: CanonicalPoints, motions: Deltas) -> Deltas:
+        assert isinstance(self.config, ConfinedConfig)
+        inside = gaussians.means.square().sum(dim=1, keepdim=True) < self.config.radius**2
+        means, scales, quats = (torch.where(inside, delta, 0.0) for delta in motions[:3])
+        return motions._replace(means=means, scales=scales, quats=quats)
+
+
+register_support(ConfinedConfig)
+
+
 # system
 @dataclass(frozen=True)
 class SparseConfig(SystemConfig):
@@ -122,6 +159,8 @@ try:
     from msdgs_export.layers import LAYERS, LayerInputs
     from msdgs_export.layers.base import FieldLayerExport, zero
     from msdgs_export.layers.graph import GraphBuilder, to_numpy
+    from msdgs_export.supports import SUPPORTS, SupportInputs
+    from msdgs_export.supports.gaussians import GaussiansExport
 except ImportError:  # training needs no onnx
     pass
 else:
@@ -164,3 +203,22 @@ else:
             return layer
 
     LAYERS[FourierConfig.kind] = FourierExport()
+
+    class ConfinedExport(GaussiansExport):
+        """`ConfinedSupport` as nodes of an ONNX graph."""
+
+        def deltas(self, graph: GraphBuilder, inputs: SupportInputs) -> dict[str, str]:
+            assert isinstance(inputs.support.config, ConfinedConfig)
+            limit = graph.constant("confined.limit", np.array(inputs.support.config.radius**2, np.float32))
+            ones = graph.constant("confined.ones", np.ones((3, 1), np.float32))
+            zero = graph.constant("confined.zero", np.zeros(1, np.float32))
+            squares = graph.node("Mul", [inputs.means, inputs.means], "confined.squares")
+            sums = graph.node("MatMul", [squares, ones], "confined.sums")
+            inside = graph.node("Less", [sums, limit], "confined.inside")
+            parts = super().deltas(graph, inputs)
+            for name in ("means", "scales", "quats"):
+                if name in parts:
+                    parts[name] = graph.node("Where", [inside, parts[name], zero], f"confined.{name}")
+            return parts
+
+    SUPPORTS[ConfinedConfig.kind] = ConfinedExport()

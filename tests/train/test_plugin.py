@@ -85,6 +85,25 @@ def test_its_layers_stand_beside_others_on_the_command_line(data: Path, tmp_path
     assert [layer["kind"] for layer in stored] == ["spline", "fourier", "mlp"]
 
 
+def test_its_support_is_trained_and_refuses_sizes(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [*SMALL, "--steps=8", "--layers", "fourier", "mlp:width=8", "--support"]
+    assert train("fit", data, tmp_path / "run", *options, "confined:radius=0") == cli.EXIT_INVALID
+    assert "`model.support.radius` must be above 0" in capsys.readouterr().err
+    assert train("fit", data, tmp_path / "run", *options, "confined:radius=0.6") == 0
+    assert train("eval", tmp_path / "run") == 0
+    model = load_model(tmp_path / "run" / "model.pt").model
+    with torch.no_grad():
+        for parameter in model.deformation.parameters():
+            parameter.add_(0.1)
+        inside = model.gaussians.means.norm(dim=1) < 0.6
+        moved = (model.pose(0.37).means != model.gaussians.means).any(dim=1)
+    assert inside.any()
+    assert not inside.all()
+    assert torch.equal(moved, inside)
+
+
 def test_without_the_plugin_the_missing_part_is_named(
     data: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -147,10 +166,10 @@ def test_the_page_shows_it(trained: Path, exported: Path) -> None:
 
 
 def test_the_documented_code_is_the_example() -> None:
-    """All code in the order layer, export, system; the other tests of this file run it."""
+    """All code; the other tests of this file run it."""
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)\n```", page, re.DOTALL)
-    layer, export, system = blocks
+    *parts, export = blocks
     imports, code = PLUGIN.read_text(encoding="utf-8").split("\n\n\n", maxsplit=1)
     assert "import" in imports
-    assert f"{layer}\n\n\n{system}\n\n{export}\n" == code
+    assert "\n\n\n".join(parts) + f"\n\n{export}\n" == code
