@@ -1,6 +1,5 @@
 """The images of a folder as frames of one camera, upright as their EXIF orientation says, and in sRGB."""
 
-import io
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from functools import cache
@@ -97,27 +96,8 @@ def read_image(file: Path) -> np.ndarray:
         raise _unreadable(file, error.problem) from None
     if (rgba[..., 3] < 255).any():
         rgba[..., :3] = (255 * composite(rgba, (0.0, 0.0, 0.0)) + 0.5).astype(np.uint8)
-    header = _header(file)
-    shown = ORIENTATIONS.get(header.orientation, lambda pixels: pixels)(rgba[..., :3])
-    return in_srgb(np.ascontiguousarray(shown), header.profile)
-
-
-def in_srgb(pixels: np.ndarray, profile: bytes) -> np.ndarray:
-    """Convert uint8 RGB [H, W, 3] from the colors of an ICC profile, such as Display P3, to sRGB.
-
-    Without a profile, or with one that can't be used, the pixels are taken to be sRGB.
-    """
-    from PIL import Image, ImageCms
-
-    if not profile:
-        return pixels
-    image = Image.fromarray(pixels)
-    try:
-        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
-        ImageCms.profileToProfile(image, source, ImageCms.createProfile("sRGB"), inPlace=True)
-    except (OSError, ImageCms.PyCMSError):  # not a profile, or one of gray or CMYK, which the reader has converted
-        return pixels
-    return np.array(image)
+    shown = ORIENTATIONS.get(_header(file).orientation, lambda pixels: pixels)(rgba[..., :3])
+    return np.ascontiguousarray(shown)
 
 
 @cache
@@ -138,7 +118,7 @@ def _unreadable(file: Path, problem: str) -> CaptureFailed:
 
 
 def _shown_size(file: Path) -> tuple[int, int]:
-    (width, height), orientation, _ = _header(file)
+    (width, height), orientation = _header(file)
     return (height, width) if orientation in TURNED else (width, height)
 
 

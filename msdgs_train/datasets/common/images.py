@@ -10,6 +10,7 @@ from msdgs_serve.files import scratch_file
 from msdgs_serve.rasterizer.jit import kernel
 from msdgs_serve.writing import writing
 from msdgs_train.datasets.common import jpeg
+from msdgs_train.datasets.common.color_profiles import to_srgb
 from msdgs_train.datasets.common.readers import DatasetInvalid
 
 EXTENSIONS = (".png", ".jpg", ".jpeg")
@@ -45,7 +46,6 @@ class ImageHeader(NamedTuple):
 
     size: ImageSize  # as it is stored
     orientation: int  # EXIF's number, 1 if it is shown as it is stored
-    profile: bytes  # ICC, empty if there is none
 
 
 def read_header(path: Path) -> ImageHeader:
@@ -53,9 +53,7 @@ def read_header(path: Path) -> ImageHeader:
     reader = _open(path)
     spec = reader.spec()
     reader.close()
-    profile = spec.getattribute("ICCProfile")
-    stored = b"" if profile is None else np.asarray(profile, np.uint8).tobytes()
-    return ImageHeader(ImageSize(spec.width, spec.height), int(spec.getattribute("Orientation") or 1), stored)
+    return ImageHeader(ImageSize(spec.width, spec.height), int(spec.getattribute("Orientation") or 1))
 
 
 def read_size(path: Path) -> ImageSize:
@@ -65,7 +63,7 @@ def read_size(path: Path) -> ImageSize:
 
 def other_shape(stated: ImageSize, path: Path) -> str:
     """Why the image isn't one of the stated size, nor a copy of it, and what to do; the end of a message."""
-    (width, height), orientation, _ = read_header(path)
+    (width, height), orientation = read_header(path)
     problem = f"but the image is {width}×{height}"
     if orientation in TURNED and stated.has_shape_of(ImageSize(height, width)):
         remedy = "store the images upright, as their poses are, without it"
@@ -74,19 +72,27 @@ def other_shape(stated: ImageSize, path: Path) -> str:
 
 
 def read_rgba(path: Path) -> np.ndarray:
-    """Read [H, W, 4] uint8, straight alpha; gray becomes RGB, without alpha it is opaque. Raises `DatasetInvalid`."""
-    pixels = read_pixels(path, "uint8")
+    """Read [H, W, 4] uint8 sRGB, straight alpha, opaque without alpha; gray becomes RGB. Raises `DatasetInvalid`."""
+    pixels, profile = _read(path, "uint8")
     channels = pixels.shape[2]
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     rgba[..., :3] = pixels[..., :3] if channels >= 3 else pixels[..., :1]
     if channels in (2, 4):
         rgba[..., 3] = pixels[..., -1]
+    if profile and (convert := to_srgb(profile)):
+        rgba[..., :3] = convert(rgba[..., :3])
     return rgba
 
 
 def read_pixels(path: Path, dtype: str) -> np.ndarray:
     """Read [H, W, channels] as "uint8" or "uint16", whose largest value is that of the file's type."""
+    return _read(path, dtype)[0]
+
+
+def _read(path: Path, dtype: str) -> tuple[np.ndarray, bytes]:
+    """The pixels, and the ICC profile, empty if there is none."""
     reader = _open(path)
+    stored = reader.spec().getattribute("ICCProfile")
     pixels = reader.read_image(dtype)
     problem, is_jpeg = reader.geterror(), reader.format_name() == "jpeg"
     reader.close()
@@ -94,7 +100,7 @@ def read_pixels(path: Path, dtype: str) -> np.ndarray:
         raise _unreadable(path, f"{problem.splitlines()[0] if problem else 'no pixels'}: {COPY_AGAIN}")
     if is_jpeg and not jpeg.is_whole(path.read_bytes()):
         raise DatasetInvalid(path, "image", f"is cut off: {COPY_AGAIN}, or store it anew if nothing is missing")
-    return pixels
+    return pixels, b"" if stored is None else np.asarray(stored, np.uint8).tobytes()
 
 
 def resize_area(rgba: np.ndarray, width: int, height: int) -> np.ndarray:

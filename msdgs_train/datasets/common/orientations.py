@@ -7,7 +7,8 @@ AS_STORED = (0, 1)
 
 
 def orientation_warnings(scene: SceneData) -> tuple[str, ...]:
-    """A warning if images are turned without another size, so that poses may be of the turned images."""
+    """A warning if images are turned without another size, or nothing says which size they have, so that poses may be
+    of the turned images."""
     frames = [frame for split in scene.splits.values() for frame in split if frame.image_path in frame.files]
     turned = [frame for frame in frames if _may_be_turned(frame)]
     if not turned:
@@ -23,5 +24,6 @@ def orientation_warnings(scene: SceneData) -> tuple[str, ...]:
 
 
 def _may_be_turned(frame: Frame) -> bool:
-    size, orientation, _ = read_header(frame.image_path)
-    return orientation not in AS_STORED and (orientation not in TURNED or size.width == size.height)
+    size, orientation = read_header(frame.image_path)
+    tells = orientation in TURNED and size.width != size.height and frame.states_size
+    return orientation not in AS_STORED and not tells

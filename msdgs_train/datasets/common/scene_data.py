@@ -51,6 +51,7 @@ class Frame:
     image_path: Path
     distortion: Distortion | None = None  # of the stored image; `load_rgba` removes it
     mask_path: Path | None = None  # an image of the stored image's size, black where pixels don't count
+    states_size: bool = True  # whether the dataset says for which size of the image its intrinsics are
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -114,7 +114,7 @@ def _read_frame(entry: JsonObject, size: int | None) -> Frame:
     distortion = checked_distortion(distortion, camera, entry.file, f"{entry.prefix}k1")
     mask = dynamic_mask(image_path) if entry.get("mask_path") is None else _named_file(entry, "mask_path")
     mask = None if mask is None else checked_mask(mask, stored, image_path)
-    return Frame(image_path.stem, camera, t, image_path, distortion, mask)
+    return Frame(image_path.stem, camera, t, image_path, distortion, mask, states_size=_states_size(entry))
 
 
 def _contradictions(content: JsonObject, frames: list[Frame]) -> list[str]:
@@ -140,8 +140,7 @@ def _named_file(entry: JsonObject, key: str, endings: tuple[str, ...] = ()) -> P
 
 def _camera(entry: JsonObject, image: ImageSize, image_path: Path) -> Camera:
     width, height = image
-    is_stated = entry.get("w") is not None or entry.get("h") is not None
-    if is_stated:
+    if _states_size(entry):
         width, height = stated = ImageSize(round(entry.number("w")), round(entry.number("h")))
         if not stated.has_shape_of(image):
             raise entry.invalid("w", f"and h are {stated}, {other_shape(stated, image_path)}")
@@ -150,7 +149,7 @@ def _camera(entry: JsonObject, image: ImageSize, image_path: Path) -> Camera:
     if fx is None or fy is None:
         raise entry.invalid("camera_angle_x", "is missing, and so is fl_x")
     cx, cy = entry.number("cx", width / 2), entry.number("cy", height / 2)
-    if not is_stated:
+    if not _states_size(entry):
         check_resolution(entry, cx, cy, image)
     matrix = entry.numbers("transform_matrix", 4, 4)
     try:
@@ -158,6 +157,10 @@ def _camera(entry: JsonObject, image: ImageSize, image_path: Path) -> Camera:
         return camera.resized(*image)
     except InvalidInput as error:
         raise entry.invalid(FIELDS.get(error.field, "transform_matrix"), f"is not a valid camera: {error}") from None
+
+
+def _states_size(entry: JsonObject) -> bool:
+    return entry.get("w") is not None or entry.get("h") is not None
 
 
 def _focal_length(entry: JsonObject, axis: str, length: int) -> float | None:

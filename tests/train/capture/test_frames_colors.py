@@ -12,6 +12,7 @@ import pytest
 from PIL import Image, ImageCms
 
 from msdgs_train.capture.image_source import read_image
+from msdgs_train.datasets.common.images import read_rgba
 from msdgs_train.datasets.common.video_colors import HLG, KNEE, PQ, as_srgb
 
 LUMA = {5: (0.299, 0.114), 1: (0.2126, 0.0722), 9: (0.2627, 0.0593)}
@@ -142,6 +143,20 @@ def test_images_are_converted_from_their_icc_profile(tmp_path: Path, ending: str
     wanted = encoded(decoded(pixels / 255) @ np.transpose(P3_TO_BT709))
     assert np.abs(wanted - pixels).max() > 20
     assert np.abs(found - wanted).max() <= 2  # lcms computes with 8 bits
+
+
+def test_datasets_are_converted_too_and_alpha_stays(tmp_path: Path):
+    rgba = np.random.default_rng(0).integers(0, 256, (8, 9, 4), np.uint8)
+    Image.fromarray(rgba).save(tmp_path / "a.png", icc_profile=display_p3())
+    found = read_rgba(tmp_path / "a.png")
+    np.testing.assert_array_equal(found[..., 3], rgba[..., 3])
+    np.testing.assert_array_equal(found[..., :3], shown(rgba[..., :3], tmp_path / "b.png", display_p3()))
+
+
+def test_a_profile_of_srgb_changes_nothing(tmp_path: Path):
+    pixels = np.random.default_rng(0).integers(0, 256, (64, 90, 3), np.uint8)
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    np.testing.assert_array_equal(shown(pixels, tmp_path / "a.png", profile), pixels)
 
 
 def test_images_without_a_profile_of_rgb_are_taken_for_srgb(tmp_path: Path):

@@ -1,5 +1,6 @@
 """Images: reading, downscaling and compositing over a background."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -152,12 +153,23 @@ def test_sizes_of_copies_are_rounded_to_pixels(stated: Any, copies: Any, others:
     assert [size for size in (*copies, *others) if ImageSize(*stated).has_shape_of(ImageSize(*size))] == copies
 
 
-@pytest.mark.parametrize(("orientation", "size", "is_told"), [(3, (32, 24), 1), (6, (32, 24), 0), (6, (24, 24), 1)])
-def test_images_that_are_shown_turned_are_told(tmp_path: Path, orientation: int, size: Any, is_told: int):
+@pytest.mark.parametrize(
+    ("orientation", "size", "states_size", "is_told"),
+    [(3, (32, 24), True, 1), (6, (32, 24), True, 0), (6, (24, 24), True, 1), (6, (32, 24), False, 1)],
+)
+def test_images_that_are_shown_turned_are_told(
+    tmp_path: Path, orientation: int, size: Any, states_size: bool, is_told: int
+):
     lens = Lens(fx=30.0, fy=30.0, cx=size[0] / 2, cy=size[1] / 2, width=size[0], height=size[1])
     frame = load_scene(write_nerfstudio(tmp_path, lens)).splits["train"][0]
     exif = Image.Exif()
     exif[0x0112] = orientation
     frame.image_path.write_bytes(jpeg(np.zeros((*size[::-1], 3), np.uint8), exif=exif))
+    if not states_size:
+        contents = json.loads((tmp_path / "transforms.json").read_text())
+        for entry in (contents, *contents["frames"]):
+            for name in ("w", "h"):
+                entry.pop(name, None)
+        (tmp_path / "transforms.json").write_text(json.dumps(contents))
     told = [text for text in load_scene(tmp_path).warnings if "1 of 2 images" in text and "EXIF" in text]
     assert len(told) == is_told
