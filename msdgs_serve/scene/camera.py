@@ -12,6 +12,8 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 """Multiply a camera-to-world matrix by it from the right to flip the camera's y and z axes."""
 
 MAX_PIXELS_PER_SIDE = 16384
+MAX_SKEW = 2e-3
+"""Of products of axes; those of three decimals are off by up to 2 √3 × 5e-4."""
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye"]
 """Projection of a point (x, y, z) in camera axes. Pinhole: fx x / z + cx. Orthographic: fx x + cx, with fx in pixels
@@ -207,7 +209,7 @@ def _vector(value: np.ndarray, name: str) -> np.ndarray:
 
 
 def _rigid(matrix: np.ndarray) -> np.ndarray:
-    """Return a rigid pose as float64, read-only; rounding of float32 rotations is tolerated."""
+    """Return a rigid pose as float64, read-only; rounding of rotations to three decimals is tolerated."""
     matrix = np.array(matrix, dtype=np.float64)
     field = "camera.camera_to_world"
     if matrix.shape != (4, 4):
@@ -215,7 +217,7 @@ def _rigid(matrix: np.ndarray) -> np.ndarray:
     if not np.isfinite(matrix).all():
         raise InvalidInput(field, "finite", "NaN or infinity")
     rotation = matrix[:3, :3]
-    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > MAX_SKEW or np.linalg.det(rotation) < 0:
         raise InvalidInput(field, "a rotation and a position, without scale or mirroring", rotation.tolist())
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         by_columns = ", not its last column" if np.abs(matrix[:, 3] - [0, 0, 0, 1]).max() <= 1e-6 else ""

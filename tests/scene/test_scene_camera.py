@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from msdgs_serve.client import Matrix, request_body
 from msdgs_serve.framing import framing
@@ -220,3 +221,14 @@ def test_level_cameras_that_look_around_say_exactly_what_is_up(up: tuple[float, 
 
 def test_a_single_camera_that_looks_down_means_the_axis_close_to_its_up():
     assert_close(framing(seen_by(orbit(CENTER, 4.0, 30, 30, UP))).up, UP, "rotation")
+
+
+def test_rotations_may_be_rounded_to_three_decimals():
+    matrix = np.eye(4)
+    for rotation in Rotation.random(200, rng=0).as_matrix():
+        matrix[:3, :3] = rotation.round(3)
+        Camera(4, 4, 2.0, 2.0, 4, 4, matrix)
+    for scale in (0.998, 1.002):
+        matrix[:3, :3] = scale * np.eye(3)
+        with pytest.raises(InvalidInput, match="without scale"):
+            Camera(4, 4, 2.0, 2.0, 4, 4, matrix)
