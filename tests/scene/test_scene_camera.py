@@ -225,7 +225,7 @@ def test_a_single_camera_that_looks_down_means_the_axis_close_to_its_up():
 
 def test_rotations_may_be_rounded_to_three_decimals():
     matrix = np.eye(4)
-    for rotation in Rotation.random(200, rng=0).as_matrix():
+    for rotation in Rotation.random(200, rng=np.random.default_rng(0)).as_matrix():
         matrix[:3, :3] = rotation.round(3)
         Camera(4, 4, 2.0, 2.0, 4, 4, matrix)
     for scale in (0.998, 1.002):
